@@ -16,7 +16,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from calibration.beams.beams import StandModel
 from calibration.rig.joint import Joint
@@ -29,7 +28,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
+from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, independent
 from lab.simulate.campaign import Campaign, CampaignQuality, draw_campaign, spots_at
 
 POSES_PER_CAMPAIGN = 5  # of the new recording; they share the errors of the calibration
@@ -54,11 +53,13 @@ def as_measured(c: Campaign) -> tuple[Network, list[ScreenSetup], StandModel]:
     rig = replace(
         c.nominal,
         cameras={
-            n: replace(d.camera, camera_from_world=c.nominal.cameras[n].camera_from_world) for n, d in c.lenses.items()
+            n: d.camera(c.nominal.cameras[n].screen, c.nominal.cameras[n].camera_from_world)
+            for n, d in c.lenses.items()
         },
     )
-    names = tuple(f"cameras.{n}.{p}" for n, d in c.lenses.items() for p in d.names)
-    prior, free = prior_of(rig, RigCovariance(names, block_diag(*(d.covariance for d in c.lenses.values()))))
+    known = [(f"cameras.{n}.", d.covariance) for n, d in c.lenses.items() if d.covariance is not None]
+    lenses = (RigCovariance(tuple(at + p for p in own.names), own.matrix) for at, own in known)
+    prior, free = prior_of(rig, independent(lenses))
     survey = np.broadcast_to(np.eye(3) * c.quality.survey_m**2, (len(c.dot_names), 3, 3))
     network = Network(
         rig,

@@ -28,6 +28,7 @@ from calibration.lens.fit.lens_adjustment import coefficient_prior
 from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations
 from calibration.lens.intrinsics_result import Intrinsics
 from calibration.terms.corners import CornerTerm
+from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera, camera_matrix
 from geometry.pose import Pose
@@ -259,15 +260,13 @@ def _result(
     separated: set[int],
     pair_rms: Array,
 ) -> CalibratedPair:
-    intrinsics, poses = adjusted.values["intrinsics"], adjusted.values["cameras"]
-    assert isinstance(intrinsics, Vectors)
-    assert isinstance(poses, Poses)
+    lenses, poses = array_of(adjusted.values, "intrinsics"), pose_of(adjusted.values, "cameras")
     cameras = []
     for c, (name, s) in enumerate(zip(names, single, strict=True)):
-        K = camera_matrix(intrinsics.array[c, :4])
-        distortion = tuple(float(v) for v in intrinsics.array[c, 4 : 4 + s.model.coefficients])
+        K = camera_matrix(lenses[c, :4])
+        distortion = tuple(float(v) for v in lenses[c, 4 : 4 + s.model.coefficients])
         lens = FISHEYE if s.model.fisheye else PERSPECTIVE
-        cameras.append(Camera(name, "", s.table.image_size_px, K, distortion, poses.pose[c], lens=lens))
+        cameras.append(Camera(name, "", s.table.image_size_px, K, distortion, poses[c], lens=lens))
     r = adjusted.residuals[0]
     rms = [float(np.sqrt(np.mean((r * problem.term.sigma_px[:, None])[problem.term.camera == c] ** 2))) for c in (0, 1)]
     misfit = float(np.sqrt(adjusted.chi2 / max(adjusted.dof, 1)))

@@ -162,8 +162,7 @@ def monte_carlo(
         error *= np.sqrt(dof / rng.chisquare(dof, size=(draws, 1)))
     if share is not None:
         error += _calibration_errors(rig, share, pose, draws, rng) @ share.adjusted.T
-    there = _copies(pose, draws)
-    measured = there.plus(error)
+    measured = pose.plus(error)
     angles = np.rad2deg(np.angle(np.exp(1j * (measured.ypr - pose.ypr))))
     values = np.concatenate([measured.translation - pose.translation, angles], axis=-1)
     low, high = np.quantile(values, [0.5 - 0.5 * COVERAGE, 0.5 + 0.5 * COVERAGE], axis=0)
@@ -179,18 +178,14 @@ def _calibration_errors(rig: Rig, share: CalibrationShare, pose: Pose, draws: in
         other = perturbed_rig(rig, names, root @ rng.normal(size=root.shape[1]))
         pixels[i] = SpotModel.of(other).project(pose)[0][share.rows]
     model, W = SpotModel.of(rig).subset(share.rows), share.weights
-    there = found = _copies(pose, draws)
+    found = pose.plus(np.zeros((draws, 6)))
     for _ in range(_ITERATIONS):
         expected, J = model.project(found)
         JW = np.swapaxes(J, -1, -2) @ W  # (draws, m, 6, 2)
         H = np.sum(JW @ J, axis=1)
         g = np.sum(JW @ (pixels - expected)[..., None], axis=1)
         found = found.plus(np.linalg.solve(H, g)[..., 0])
-    return found.minus(there)
-
-
-def _copies(pose: Pose, n: int) -> Pose:
-    return Pose(np.tile(pose.rotation, (n, 1, 1)), np.tile(pose.translation, (n, 1)))
+    return found.minus(pose)
 
 
 def along_axes(covariances: Array, pose: Pose) -> Array:

@@ -20,6 +20,7 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.camera import FISHEYE, in_picture, pinhole_numbers, project_points_full
 from geometry.compiled_projection import VIEW, Views, derivatives_all, lens_codes, lit_points, project_all
 from geometry.lens import padded, tilt_matrix
+from geometry.planes import intersect_plane, screen_to_world
 from geometry.pose import Pose
 from geometry.rig import Rig
 
@@ -54,6 +55,7 @@ class SpotModel:
     spot_names: tuple[str, ...]
     camera_of: Ints  # (n,) index into camera_names
     spot_of: Ints  # (n,) index into spot_names
+    screen_of: Ints  # (n,) index into the rig's screens
     beam_of: Ints  # (n,) index into the rig's beams
     point: Array  # (n, 3), m, in body: the beam's point
     ray: Array  # (n, 3), unit, in body: from that point towards the spot
@@ -91,7 +93,8 @@ class SpotModel:
         spots = [rig.spots[s] for _, s in views]
         beams = [rig.beams[s.beam] for s in spots]
         screens = [rig.screens[s.screen] for s in spots]
-        camera_names, spot_names, beam_names = list(rig.cameras), list(rig.spots), list(rig.beams)
+        camera_names, spot_names = list(rig.cameras), list(rig.spots)
+        screen_names, beam_names = list(rig.screens), list(rig.beams)
 
         def rows(values: list[Array], width: int) -> Array:
             return np.array(values, dtype=float).reshape(len(views), width)
@@ -105,6 +108,7 @@ class SpotModel:
             spot_names=tuple(spot_names),
             camera_of=np.array([camera_names.index(c) for c, _ in views], dtype=np.int64),
             spot_of=np.array([spot_names.index(s) for _, s in views], dtype=np.int64),
+            screen_of=np.array([screen_names.index(s.screen) for s in spots], dtype=np.int64),
             beam_of=np.array([beam_names.index(b.name) for b in beams], dtype=np.int64),
             point=rows([b.point for b in beams], 3),
             ray=rows([s.sign * b.direction for s, b in zip(spots, beams, strict=True)], 3),
@@ -200,3 +204,14 @@ def _stacked(poses: Pose, rows: tuple[int, ...] = ()) -> tuple[Array, Array, tup
         np.array(t, dtype=np.float64, order="C").reshape(-1, 3),
         stack,
     )
+
+
+def points_on_screens(rig: Rig, view: Ints, pixels: Array) -> Array:
+    """World points (N, 3), m, on the planes of the screens, of pixels (N, 2) of some views (N,); nan for nan."""
+    out = np.full((len(pixels), 3), np.nan)
+    for v, (camera, spot) in enumerate(rig.views()):
+        rows = np.flatnonzero((view == v) & ~np.isnan(pixels[:, 0]))
+        if len(rows):
+            screen = rig.screens[rig.spots[spot].screen].world_from_screen
+            out[rows] = screen_to_world(intersect_plane(*rig.cameras[camera].rays(pixels[rows]), screen), screen)
+    return out

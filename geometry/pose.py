@@ -77,7 +77,7 @@ class Pose:
     def plus(self, delta: Array) -> Pose:
         """The transform changed by `delta` (..., 6) = [dt (m, in a), dtheta (rad, in b)]: t + dt and R Exp(dtheta).
 
-        This is the pose error of section 1 of the file contract.
+        This is the pose error of section 1 of the file contract. Of one transform and many deltas, a stack.
         """
         delta = np.asarray(delta, dtype=float)
         return Pose(self.rotation @ rotations.exp(delta[..., 3:]), self.translation + delta[..., :3])

@@ -96,18 +96,18 @@ _MEANINGS_BY_METHOD = {
 
 
 def view_statuses(
-    seen: Bools, turned: Bools, exists: Bools, inside: Bools, has_image: Sequence[bool] | Bools, known: bool
+    seen: Bools, turned: Bools, exists: Bools, inside: Bools, has_image: Sequence[bool] | Bools, known: Bools | bool
 ) -> tuple[SpotStatus, ...]:
-    """The status of every view from a pose; all arguments (n,), except `known`.
+    """The status of every view from a pose; all arguments (n,), or one `known` for all.
 
     seen: a detection has the label; turned: at a bend; exists: the pose projects the spot; inside: into the image;
-    has_image: its camera has a picture. known: there is a pose.
+    has_image: its camera has a picture; known: there is a pose.
     """
-    out = []
+    out, known = [], np.broadcast_to(known, len(seen))
     for i in range(len(seen)):
         if seen[i]:
             out.append(SpotStatus.TURNED if turned[i] else SpotStatus.MATCHED)
-        elif not known:
+        elif not known[i]:
             out.append(SpotStatus.LOST)
         elif not exists[i]:
             out.append(SpotStatus.OFF_SCREEN)

@@ -50,7 +50,7 @@ def _write_results(folder: Path) -> None:
     process_run(folder / "points", folder / "results")
     process_batch([folder / "points"], folder / "batch", BatchOptions(parquet=HAS_PYARROW))
     shutil.copy(folder / "points" / "truth" / "pose.csv", folder / "reference.csv")
-    truth = read_reference(folder / "reference.csv").motion
+    truth, _ = read_reference(folder / "reference.csv")
     assert truth.position_m is not None
     assert truth.rotation is not None
     w, x, y, z = quaternion_from_matrix(truth.rotation).T

@@ -37,7 +37,7 @@ from calibration.terms.rig_blocks import (
     SpotPixels,
     SpotTerm,
     lines_in,
-    named_errors,
+    named_covariance,
     prior_of,
     rig_of,
     stacks_of,
@@ -274,9 +274,7 @@ def _known(rig: Rig, knowledge: RigCovariance | None) -> tuple[list[Term], dict[
     """Priors of cameras and screens, and their free parameters."""
     if knowledge is None:
         return [], {}
-    of_the_lab = np.array([not n.startswith("beams.") for n in knowledge.names], dtype=bool)
-    names = tuple(n for n in knowledge.names if not n.startswith("beams."))
-    prior, free = prior_of(rig, RigCovariance(names, knowledge.matrix[np.ix_(of_the_lab, of_the_lab)]))
+    prior, free = prior_of(rig, knowledge.part([not n.startswith("beams.") for n in knowledge.names]))
     return ([] if prior is None else [prior]), dict(free)
 
 
@@ -317,15 +315,13 @@ def _finished(
     joint = K @ joint @ K.T
     values = {**values, BEAMS: lines}
     in_rig = np.concatenate([np.full(values[s].dof, s != STAND) for s, _ in at])
-    names, T = named_errors(rig, values, [a for a in at if a[0] != STAND])
-    matrix = T @ joint[np.ix_(in_rig, in_rig)] @ T.T
+    of_rig = named_covariance(rig, values, [a for a in at if a[0] != STAND], joint[np.ix_(in_rig, in_rig)])
     of_lines = joint[: len(slide), : len(slide)]
     poses = pose_of(values, STAND)[0] @ pose_of(values, POSES)
     collinearity = opposed_pairs(list(rig.beams), lines, of_lines) + _end_collinearity(rig, kept, values, others, free)
-    named = np.diagonal(matrix) > 0
     return BeamCalibration(
         rig=rig_of(rig, values),
-        covariance=RigCovariance(tuple(np.array(names)[named].tolist()), matrix[np.ix_(named, named)]),
+        covariance=of_rig,
         lines=lines,
         lines_covariance=of_lines,
         angles=angles_between(list(rig.beams), lines, of_lines),

@@ -103,27 +103,16 @@ def _of_records(rig: Rig, spots: SpotPixels, stand: StandModel) -> list[_Candida
 def _other_records(poses: Pose) -> Iterator[tuple[RecordingError, Pose]]:
     """The record with each common mistake corrected."""
     q, t = poses.quaternion_wxyz, poses.translation
-    yield (
-        RecordingError(
-            False, "with their quaternions read in the order x, y, z, w", "write them in the order qw, qx, qy, qz"
-        ),
-        Pose.from_quaternion(np.roll(q, 1, axis=-1), t),
-    )
-    yield (
-        RecordingError(False, "inverted", "write stand_from_body, the body's pose in the stand, and not its inverse"),
-        poses.inverse(),
-    )
-    turned = np.swapaxes(poses.rotation, -1, -2)
-    yield (
-        RecordingError(
-            False, "with their rotations inverted", "write quaternions that rotate from the body to the stand"
-        ),
-        Pose(turned, t),
-    )
+    turned, swapped = Pose(np.swapaxes(poses.rotation, -1, -2), t), Pose.from_quaternion(np.roll(q, 1, axis=-1), t)
+    order = "with their quaternions read in the order x, y, z, w", "write them in the order qw, qx, qy, qz"
+    yield RecordingError(False, *order), swapped
+    inverse = "inverted", "write stand_from_body, the body's pose in the stand, and not its inverse"
+    yield RecordingError(False, *inverse), poses.inverse()
+    way = "with their rotations inverted", "write quaternions that rotate from the body to the stand"
+    yield RecordingError(False, *way), turned
     for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e3, "kilometres")):
-        remedy = "write x_m, y_m, z_m in metres"
         words = f"with their positions times {factor:g} ({unit} were written)"
-        yield RecordingError(False, words, remedy), Pose(poses.rotation, factor * t)
+        yield RecordingError(False, words, "write x_m, y_m, z_m in metres"), Pose(poses.rotation, factor * t)
 
 
 def _shifted(n: int) -> RecordingError:

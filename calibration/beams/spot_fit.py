@@ -18,8 +18,7 @@ from scipy.special import chdtri
 from calibration.least_squares.adjustment import Adjusted, AdjustmentError, Cauchy, Free, Limits, Term, Values, solve
 from calibration.terms.rig_blocks import SpotPixels, SpotTerm
 from geometry.arrays import Array, Bools, Ints, normalised
-from geometry.forward_model import SpotModel
-from geometry.planes import intersect_plane, screen_to_world
+from geometry.forward_model import SpotModel, points_on_screens
 from geometry.pose import Pose
 from geometry.pose_solver.closed_form import pose_from_lines
 from geometry.pose_solver.gauss_newton import PoseFit, fit_pose
@@ -31,27 +30,13 @@ _NEAR_M = 0.02  # m from the line: spots at least this near are inliers
 _START_ATTITUDES = Rotation.create_group("O")
 
 
-def world_points(rig: Rig, spots: SpotPixels) -> Array:
-    """Positions (N, 3), m, of the spots on their screens, in world, from the calibrated cameras; flat screens."""
-    out = np.full((len(spots), 3), np.nan)
-    for v, (camera, spot) in enumerate(rig.views()):
-        rows = spots.view == v
-        if rows.any():
-            screen = rig.screens[rig.spots[spot].screen].world_from_screen
-            origin, direction = rig.cameras[camera].rays(spots.pixels[rows])
-            out[rows] = screen_to_world(
-                intersect_plane(np.broadcast_to(origin, direction.shape), direction, screen), screen
-            )
-    return out
-
-
 def beams_through_spots(rig: Rig, spots: SpotPixels, world_from_body: Pose) -> dict[str, Beam]:
     """Each beam as the line through its spots in the body frame; beams without such a line are missing.
 
     world_from_body: (P,) of the stand's positions. A line requires spots at two places along it: at positions of
     different distance from the screen, or at both ends.
     """
-    points = world_from_body[spots.position].inverse().apply(world_points(rig, spots))
+    points = world_from_body[spots.position].inverse().apply(points_on_screens(rig, spots.view, spots.pixels))
     model = SpotModel.of(rig)
     out = {}
     for b, name in enumerate(rig.beams):
@@ -96,7 +81,7 @@ def body_poses(rig: Rig, spots: SpotPixels, count: int) -> list[PoseFit | None]:
     Spots are not checked for outliers; a wrong one affects its position.
     """
     model = SpotModel.of(rig)
-    points = world_points(rig, spots)
+    points = points_on_screens(rig, spots.view, spots.pixels)
     out: list[PoseFit | None] = []
     last: Pose | None = None
     for k in range(count):

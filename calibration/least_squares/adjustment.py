@@ -188,6 +188,12 @@ At = tuple[str, int]  # name of a stack and index of one of its unknowns
 Basis = Mapping[str, Array]
 
 
+def places(at: Sequence[At], values: Values) -> dict[At, Ints]:
+    """The positions of the numbers of each unknown in the vector of the errors of all."""
+    ends = np.cumsum([values[stack].dof for stack, _ in at])
+    return {a: np.arange(end - values[a[0]].dof, end) for a, end in zip(at, ends, strict=True)}
+
+
 @dataclass(frozen=True, slots=True)
 class Part:
     """Derivatives of a term's residuals by the unknowns of one stack."""

@@ -117,7 +117,7 @@ def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = 
     flat = fit(table, found.used, found.model, {**found.values, **stated}, AS_STATED, limits=BRIEF)
     bent = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True), limits=BRIEF)
     test = _Evidence.of(table, bent)
-    warp, why = test.is_bent, test.why_bent
+    warp, why = test.bent()
     if options.warp is not None:
         warp, why = options.warp, "as requested"
     C = test.covariance
@@ -128,7 +128,7 @@ def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = 
     )  # fmt: skip
     kept, stretch_test = (bent if warp else flat), None
     if len(test.shape) > 3:
-        stretch, why, change = test.is_stretched, test.why_stretched, 0.0
+        (stretch, why), change = test.stretched(), 0.0
         if options.stretch is not None:
             stretch, why = options.stretch, "as requested"
         if stretch or test.p_stretch < SIGNIFICANT:
@@ -192,36 +192,29 @@ class _Evidence:
             _p_value(x[part], C[part, part]) < HALF_SIGNIFICANT for x, C in self.halves
         )
 
-    @property
-    def is_bent(self) -> bool:
-        return self.p_warp < SIGNIFICANT and self._in_both_halves(_WARP)
-
-    @property
-    def why_bent(self) -> str:
+    def bent(self) -> tuple[bool, str]:
+        """Whether the board is bent, and why, or why not."""
         if self.p_warp >= SIGNIFICANT:
-            return "not significantly different from a flat board"
-        return "significant in both halves of the photographs" if self.is_bent else _NOT_IN_HALVES
+            return False, "not significantly different from a flat board"
+        return (True, _IN_HALVES) if self._in_both_halves(_WARP) else (False, _NOT_IN_HALVES)
 
-    @property
-    def is_stretched(self) -> bool:
-        explains = self.scatter.p_value >= EXPLAINED
-        return self.p_stretch < SIGNIFICANT and self._in_both_halves(_STRETCH) and explains
-
-    @property
-    def why_stretched(self) -> str:
+    def stretched(self) -> tuple[bool, str]:
+        """Whether rows and columns are not to scale, and why, or why not."""
         if self.p_stretch >= SIGNIFICANT:
-            return "not significantly different from rows and columns to scale"
+            return False, "not significantly different from rows and columns to scale"
         if not self._in_both_halves(_STRETCH):
-            return _NOT_IN_HALVES
-        if not self.is_stretched:
-            return (
-                f"significant in both halves of the photographs, but it does not explain them: they still scatter"
-                f" {self.scatter.factor:.1f} times more than noise"
-            )
-        return "significant in both halves of the photographs, and it explains them"
+            return False, _NOT_IN_HALVES
+        if self.scatter.p_value < EXPLAINED:
+            return False, f"{_IN_HALVES}, but it does not explain them: {_still(self.scatter)}"
+        return True, f"{_IN_HALVES}, and it explains them"
 
 
+_IN_HALVES = "significant in both halves of the photographs"
 _NOT_IN_HALVES = "significant, but not in both halves of the photographs"
+
+
+def _still(left: Scatter) -> str:
+    return f"they still scatter {left.factor:.1f} times more than noise"
 
 
 def _change_px(table: CornerTable, first: LensFit, second: LensFit) -> float:
@@ -258,17 +251,13 @@ def _points(
     except AdjustmentError as problem:
         return PointsTest(nothing, p, False, f"significant, but they cannot be solved for: {problem}"), found
     off = np.where((seen > 0)[:, None], _without_similarity(table.board_points, freed.printed), 0.0)
+    change = _change_px(table, found, freed)
     if worse and options.stretch is None:
-        why = "significant in both halves of the photographs, but with them directions are less well known"
-        return PointsTest(off, p, False, why, _change_px(table, found, freed)), found
+        return PointsTest(off, p, False, f"{_IN_HALVES}, but with them directions are less well known", change), found
     if left.p_value < EXPLAINED and options.stretch is None:
-        why = (
-            f"significant in both halves of the photographs, but they do not explain them: they still scatter"
-            f" {left.factor:.1f} times more than noise"
-        )
-        return PointsTest(off, p, False, why, _change_px(table, found, freed)), found
-    why = "significant in both halves of the photographs, and they explain them"
-    return PointsTest(off, p, True, why, _change_px(table, found, freed)), freed
+        why = f"{_IN_HALVES}, but they do not explain them: {_still(left)}"
+        return PointsTest(off, p, False, why, change), found
+    return PointsTest(off, p, True, f"{_IN_HALVES}, and they explain them", change), freed
 
 
 def _direction_sigma_px(table: CornerTable, found: LensFit) -> float:

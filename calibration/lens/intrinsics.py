@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.least_squares.adjustment import AdjustmentError, Poses, Values
+from calibration.least_squares.adjustment import AdjustmentError, Values
 from calibration.lens.board_shape import MOST_POINTS, SIGNIFICANT, BoardShapeOptions, BoardTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import coverage_of, spread_deg
@@ -30,6 +30,7 @@ from calibration.lens.fit.projection_map import Difference, ProjectionMap, diffe
 from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations, scattered
 from calibration.lens.intrinsics_result import Intrinsics, Origins
 from calibration.lens.model_uncertainty import estimate_model_uncertainty
+from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Bools
 
 FEWEST_VIEWS = 4
@@ -157,9 +158,7 @@ def _starts(table: CornerTable) -> list[tuple[LensModel, Values]]:
 
 def _check_tilts(values: Values) -> None:
     """Raises IntrinsicsError if all boards are parallel: they fit any focal length."""
-    boards = values["boards"]
-    assert isinstance(boards, Poses)
-    normals = boards.pose.rotation[..., 2]
+    normals = pose_of(values, "boards").rotation[..., 2]
     normals = normals[np.isfinite(normals).all(axis=1)]
     spread = spread_deg(normals)
     if spread < LEAST_TILT_DEG:

@@ -16,7 +16,7 @@ that camera and 1.0 for the others, and p stays above 1e-4.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -24,11 +24,11 @@ import numpy as np
 
 from calibration.model_check.fault_identification import (
     Effect,
-    EffectContext,
     FaultDiagnosis,
     WeightedDiagnosis,
     diagnose_with_noise_of_cameras,
     effect_of,
+    pose_variances,
 )
 from calibration.model_check.faults import FaultParameters, possible_faults
 from calibration.model_check.linearised_frames import (
@@ -83,51 +83,27 @@ class Statistics:
     beams: tuple[GroupStatistics, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Groups:
-    """What the statistics of every group are computed from: K frames of n views."""
-
-    lin: LinearisedFrames
-    uv_px: Array  # (K, n, 2) measured; nan for unused views
-    nis: Array | None  # (K, n) normalised innovations squared
-    calibration_px: Mapping[str, Array]  # (2,) by `group_key`
-
-
 def nis_band(frames: float) -> tuple[float, float]:
     """Central 95 % interval of the mean of NIS / 2 over independent frames: a gamma distribution of mean 1."""
     shape = max(frames, 1.0)
     return gamma_quantile(0.975, shape) / shape, gamma_quantile(0.025, shape) / shape
 
 
-def statistics(
-    model: SpotModel,
-    beam_names: tuple[str, ...],
-    recording: ModelCheckRecording,
-    lin: LinearisedFrames,
-    calibration_px: Mapping[str, Array],
-) -> Statistics:
-    """Statistics of the linearised frames of a recording. calibration_px: by `group_key`; 0 for missing groups."""
-    uv = np.where(lin.used[..., None], recording.uv_px[lin.frames], np.nan)
-    groups = _Groups(lin, uv, _nis(recording, lin), calibration_px)
-
-    def group(kind: str, name: str, views: Ints) -> GroupStatistics:
-        return _group(group_key(kind, name), name, views, groups)
-
-    return Statistics(
-        views=tuple(group("view", f"{c}/{s}", np.array([i])) for i, (c, s) in enumerate(model.views)),
-        cameras=tuple(
-            group("camera", c, np.flatnonzero(model.camera_of == i)) for i, c in enumerate(model.camera_names)
-        ),
-        beams=tuple(group("beam", b, np.flatnonzero(model.beam_of == i)) for i, b in enumerate(beam_names)),
-    )
+def groups_of(model: SpotModel, beam_names: Sequence[str]) -> dict[str, dict[str, Ints]]:
+    """The views of each group, by the fields of `Statistics` and by name."""
+    return {
+        "views": {f"{c}/{s}": np.array([i]) for i, (c, s) in enumerate(model.views)},
+        "cameras": {c: np.flatnonzero(model.camera_of == i) for i, c in enumerate(model.camera_names)},
+        "beams": {b: np.flatnonzero(model.beam_of == i) for i, b in enumerate(beam_names)},
+    }
 
 
 def calibration_sigmas_px(
-    lin: LinearisedFrames, jacobian: Array, covariance: Array, model: SpotModel, beam_names: tuple[str, ...]
-) -> Mapping[str, Array]:
-    """By `group_key`, 1 sigma (2,), px, of the group's mean residual that the calibration's stated errors cause.
+    lin: LinearisedFrames, jacobian: Array, covariance: Array, groups: Mapping[str, Mapping[str, Ints]]
+) -> dict[tuple[str, str], Array]:
+    """By kind and name, 1 sigma (2,), px, of a group's mean residual that the calibration's stated errors cause.
 
-    jacobian (K, n, 2, p), whitened; covariance (p, p), as the calibration states it.
+    jacobian (K, n, 2, p), whitened; covariance (p, p), as the calibration states it. Empty where it states nothing.
     """
     known = np.flatnonzero(np.diagonal(covariance) > 0)
     if not known.size:
@@ -143,17 +119,7 @@ def calibration_sigmas_px(
         mean = np.sum(weight[..., None] * np.where(weight[..., None] > 0, off, 0.0), axis=(0, 1)) / total[:, None]
         return np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", mean, C, mean), 0.0))
 
-    out = {group_key("view", f"{c}/{s}"): sigma(np.array([i])) for i, (c, s) in enumerate(model.views)}
-    for i, c in enumerate(model.camera_names):
-        out[group_key("camera", c)] = sigma(np.flatnonzero(model.camera_of == i))
-    for i, b in enumerate(beam_names):
-        out[group_key("beam", b)] = sigma(np.flatnonzero(model.beam_of == i))
-    return out
-
-
-def group_key(kind: str, name: str) -> str:
-    """`camera right`: a camera and a beam may have the same name."""
-    return f"{kind} {name}"
+    return {(kind, name): sigma(views) for kind, named in groups.items() for name, views in named.items()}
 
 
 def _weights(covariance: Array) -> Array:
@@ -186,8 +152,10 @@ def _nis_mean(nis: Array) -> NisMean | None:
     return NisMean(level, *nis_band(len(values) / correlation_time((series - np.nanmean(series))[:, None])))
 
 
-def _group(key: str, name: str, views: Ints, groups: _Groups) -> GroupStatistics:
-    lin = groups.lin
+def _group(
+    name: str, views: Ints, lin: LinearisedFrames, uv_px: Array, nis: Array | None, calibration_px: Array
+) -> GroupStatistics:
+    """uv_px (K, n, 2): measured; nis (K, n)."""
     r, spread = lin.leave_group_out(views, lin.residual)
     known = finite(r, -1)
     frames = known.any(axis=1)
@@ -210,7 +178,7 @@ def _group(key: str, name: str, views: Ints, groups: _Groups) -> GroupStatistics
         mean_sigmas = mean * np.sqrt(information.mean(axis=0))
         z = (whitening(spread, known) @ gap[..., None])[known]
         scatter = float(np.sum(z**2) / (2 * len(z)))
-    place = groups.uv_px[:, views[0]][lin.used[:, views[0]]] if len(views) == 1 else np.empty((0, 2))
+    place = uv_px[:, views[0]][lin.used[:, views[0]]] if len(views) == 1 else np.empty((0, 2))
     seen = int((lin.used | lin.outlier)[:, views].sum())
     return GroupStatistics(
         name=name,
@@ -218,9 +186,9 @@ def _group(key: str, name: str, views: Ints, groups: _Groups) -> GroupStatistics
         mean_px=mean,
         sigma_of_mean_px=sigma_of_mean,
         mean_sigmas=mean_sigmas,
-        calibration_px=groups.calibration_px.get(key, np.zeros(2)),
+        calibration_px=calibration_px,
         scatter=scatter,
-        nis=None if groups.nis is None else _nis_mean(groups.nis[:, views]),
+        nis=None if nis is None else _nis_mean(nis[:, views]),
         place_px=place.mean(axis=0) if len(place) else none,
         outliers=float(lin.outlier[:, views].sum() / seen) if seen else 0.0,
     )
@@ -268,7 +236,7 @@ def evaluate_model(
     bounded whatever the length of the recording: its frames are thinned evenly. Raises ValueError: the recording has
     other views than the rig; KeyError: `calibration` names a parameter that the rig does not have.
     """
-    model, beams = SpotModel.of(rig), tuple(rig.beams)
+    model = SpotModel.of(rig)
     if recording.seen.shape[1] != len(model):
         raise ValueError(f"recording: expected {len(model)} views as the rig has, got {recording.seen.shape[1]}")
     testable = np.flatnonzero(recording.usable.sum(axis=1) >= FEWEST_SPOTS)
@@ -279,14 +247,24 @@ def evaluate_model(
     most = min(MOST_FRAMES_FOR_DIAGNOSIS, max(FEWEST_FRAMES, _LARGEST_ARRAY // max(numbers_per_frame, 1)))
     lin = linearise(model, recording, evenly_spaced(testable, most))
     jacobian = parameters.jacobian(recording, lin)
-    calibration_px = calibration_sigmas_px(lin, jacobian, parameters.covariance, model, beams)
+    groups = groups_of(model, tuple(rig.beams))
+    calibration_px = calibration_sigmas_px(lin, jacobian, parameters.covariance, groups)
     all_frames = linearise(model, recording, evenly_spaced(testable, MOST_FRAMES))
-    groups = statistics(model, beams, recording, all_frames, calibration_px)
+    uv, nis = recording.uv_px[all_frames.frames], _nis(recording, all_frames)
+    statistics = Statistics(
+        **{
+            kind: tuple(
+                _group(name, views, all_frames, uv, nis, calibration_px.get((kind, name), np.zeros(2)))
+                for name, views in named.items()
+            )
+            for kind, named in groups.items()
+        }
+    )
     unseen = unseen_views(model, recording, all_frames.frames)
     usual = int(np.count_nonzero(recording.seen[all_frames.frames].mean(axis=0) >= 0.5))
     counts = len(all_frames.frames), len(lin.frames)
     if lin.dof <= 0:
-        return ModelCheckResult(*counts, NotTested.NO_REDUNDANCY, statistics=groups, unseen=unseen, usual_views=usual)
+        return ModelCheckResult(*counts, NotTested.NO_REDUNDANCY, statistics, unseen=unseen, usual_views=usual)
     faults = possible_faults(rig, parameters)
     weighted = diagnose_with_noise_of_cameras(parameters, recording, lin, jacobian, faults)
     if weighted.diagnosis.unexplained:
@@ -298,7 +276,7 @@ def evaluate_model(
             weighted, counts = without, (len(all_frames.frames), len(usual_frames))
     return ModelCheckResult(
         *counts,
-        statistics=groups,
+        statistics=statistics,
         diagnosis=weighted.diagnosis,
         effects=_effects(weighted, parameters, recording),
         unseen=unseen,
@@ -323,10 +301,9 @@ def _usual_frames(lin: LinearisedFrames) -> Ints:
 def _effects(
     weighted: WeightedDiagnosis, parameters: FaultParameters, recording: ModelCheckRecording
 ) -> tuple[tuple[Effect, ...], ...]:
-    lin, diagnosis = weighted.lin, weighted.diagnosis
-    stated = None if recording.pose_covariance is None else recording.pose_covariance[lin.frames]
-    context = EffectContext(lin, weighted.jacobian, parameters.covariance, stated, diagnosis.excess_noise)
+    stated = None if recording.pose_covariance is None else recording.pose_covariance[weighted.lin.frames]
+    variances = pose_variances(weighted, parameters.covariance, stated)
     return tuple(
-        tuple(effect_of(context, e.fault.directions @ e.change.delta, e.fault.views) for e in suspected.explanations)
-        for suspected in diagnosis.suspected_faults
+        tuple(effect_of(weighted, variances, e) for e in suspected.explanations)
+        for suspected in weighted.diagnosis.suspected_faults
     )

@@ -16,7 +16,7 @@ import numpy as np
 from calibration.changes import Change, ChangeCandidate, ExcessResidual
 from calibration.model_check.faults import PIXEL_OFFSET, VIEW, FaultParameters, PossibleFault
 from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, correlation_time, linearise
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array
 from geometry.forward_model import SpotModel
 
 P_FALSE_ALARM = 1e-6  # probability that a recording of a correct rig leads to any suspected fault, over all candidates
@@ -272,26 +272,15 @@ class Effect:
     pose_sigmas: float  # largest ratio of bias to stated sigma over x, y, z and the three rotations; nan likewise
 
 
-@dataclass(frozen=True, slots=True)
-class EffectContext:
-    """What the effects of all faults of one recording are computed from: K frames, n views, p parameters."""
-
-    lin: LinearisedFrames
-    jacobian: Array  # (K, n, 2, p) of the whitened pixels by the parameters
-    covariance: Array  # (p, p) of the parameters, stated by the calibration
-    pose_covariance: Array | None  # (K, 6, 6) stated by the run; None: that of single-frame fits plus the calibration's
-    noise_scale: float = 1.0  # ratio of the spots' random errors to their stated sigmas
-
-
-def effect_of(context: EffectContext, theta: Array, views: Bools) -> Effect:
-    """The effect of parameter changes theta (p,). views (n,): those that are considered for `off_px`."""
-    lin = context.lin
-    moved = context.jacobian @ theta
+def effect_of(weighted: WeightedDiagnosis, variances: Array, fitted: FittedFault) -> Effect:
+    """The effect of a fault on the views that it affects, and on the poses, of these variances (K, 6)."""
+    lin, noise_scale, views = weighted.lin, weighted.diagnosis.excess_noise, fitted.fault.views
+    moved = weighted.jacobian @ (fitted.fault.directions @ fitted.change.delta)
     weights = lin.inverse_redundancy()
     off = (weights @ lin.residual_part(moved)[..., None])[..., 0]
     back = np.linalg.inv(np.where(lin.used[..., None, None], lin.W, np.eye(2)))
     off_px = (back @ off[..., None])[..., 0]
-    sigma_px = context.noise_scale * np.sqrt(np.diagonal(back @ np.swapaxes(back, -1, -2), axis1=-2, axis2=-1))
+    sigma_px = noise_scale * np.sqrt(np.diagonal(back @ np.swapaxes(back, -1, -2), axis1=-2, axis2=-1))
     px, sigmas = _rms(off_px), _rms(off_px / sigma_px)
     sigmas_of_views = np.where(views[:, None] & np.isfinite(sigmas), sigmas, -1.0)
     view, axis = (int(i) for i in np.unravel_index(np.argmax(sigmas_of_views), sigmas.shape))
@@ -303,7 +292,7 @@ def effect_of(context: EffectContext, theta: Array, views: Bools) -> Effect:
     if own.any():
         turn = float(np.rad2deg(np.sqrt(np.mean(np.sum(bias[:, 3:] ** 2, axis=1)))))
         move = float(1e3 * np.sqrt(np.mean(np.sum(bias[:, :3] ** 2, axis=1))))
-        variances = _stated_variances(context)[own]
+        variances = variances[own]
         known = np.isfinite(variances).all(axis=1) & (variances > 0).all(axis=1)
         if known.any():
             pose_sigmas = float(np.sqrt(np.mean(bias[known] ** 2 / variances[known], axis=0)).max())
@@ -318,15 +307,18 @@ def effect_of(context: EffectContext, theta: Array, views: Bools) -> Effect:
     )
 
 
-def _stated_variances(context: EffectContext) -> Array:
-    """(K, 6) variances of the poses, m^2 and rad^2."""
-    lin, covariance = context.lin, context.covariance
-    if context.pose_covariance is not None:
-        return np.asarray(np.diagonal(context.pose_covariance, axis1=-2, axis2=-1))
-    variances = context.noise_scale**2 * np.diagonal(lin.normal_inverse, axis1=-2, axis2=-1)
+def pose_variances(weighted: WeightedDiagnosis, covariance: Array, stated: Array | None) -> Array:
+    """(K, 6) variances of the poses, m^2 and rad^2.
+
+    stated (K, 6, 6): by the run; None: of fits to single frames, with the calibration's covariance (p, p).
+    """
+    if stated is not None:
+        return np.asarray(np.diagonal(stated, axis1=-2, axis2=-1))
+    lin = weighted.lin
+    variances = weighted.diagnosis.excess_noise**2 * np.diagonal(lin.normal_inverse, axis1=-2, axis2=-1)
     known = np.flatnonzero(np.diagonal(covariance) > 0)
     if known.size:
-        shifts = lin.pose_shift(context.jacobian[..., known])
+        shifts = lin.pose_shift(weighted.jacobian[..., known])
         variances = variances + np.einsum("kip,pq,kiq->ki", shifts, covariance[np.ix_(known, known)], shifts)
     return np.asarray(variances)
 

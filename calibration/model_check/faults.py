@@ -166,10 +166,9 @@ def _delayed_cameras(model: SpotModel, index: dict[str, int]) -> list[PossibleFa
 
 def _screen_faults(rig: Rig, model: SpotModel, index: dict[str, int]) -> list[PossibleFault]:
     """Only displacements out of the screen's own plane: others do not change the pixels."""
-    screen_of = [rig.spots[s].screen for _, s in model.views]
     faults = []
-    for name, screen in rig.screens.items():
-        views = np.array([s == name for s in screen_of])
+    for i, (name, screen) in enumerate(rig.screens.items()):
+        views = model.screen_of == i
         forward = _directions(index, f"screens.{name}", POSE[:3], screen.world_from_screen.rotation[:, 2:])
         tilt = _directions(index, f"screens.{name}", POSE[3:5], np.eye(2))
         sizes = np.array([USUAL_SIZES.move_m, USUAL_SIZES.turn_rad, USUAL_SIZES.turn_rad])

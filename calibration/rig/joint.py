@@ -15,8 +15,15 @@ from scipy.special import chdtrc, chdtri
 
 from calibration.beams.beams import StandModel
 from calibration.least_squares.adjustment import Adjusted, At, Cauchy, Free, Limits, Poses, Prior, Term, Values, solve
-from calibration.screens.flatness import smallest_scatter
-from calibration.screens.network import Network, NetworkFit, flat_boards, normalised_residuals
+from calibration.screens.network import (
+    SURFACES,
+    SURVEY,
+    Network,
+    NetworkFit,
+    normalised_residuals,
+    point_term,
+    stated_terms,
+)
 from calibration.terms.rig_blocks import (
     BEAMS,
     BOWS,
@@ -27,23 +34,17 @@ from calibration.terms.rig_blocks import (
     STAND,
     SpotPixels,
     SpotTerm,
-    named_errors,
+    named_covariance,
     rig_of,
 )
 from calibration.terms.surveyed import (
-    FrameTerm,
-    PointTerm,
     RecordTerm,
-    SurfaceTerm,
-    SurveyTerm,
     picked,
     pose_of,
     rows_of,
-    whitening,
     widened,
 )
 from geometry.arrays import Array, Bools, Ints
-from geometry.camera import FISHEYE
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 
@@ -62,29 +63,24 @@ class Unknowns:
     """Positions of the unknowns in one long vector."""
 
     at: tuple[At, ...]
-    start: Mapping[str, int]  # per block with free parameters
-    dof: Mapping[str, int]
+    column: Mapping[str, Ints]  # (k, dof) per block with free parameters
     size: int
 
     @staticmethod
     def of(values: Values, free: Free) -> Unknowns:
         """All unknowns of the blocks with free parameters, including their fixed ones."""
         at: list[At] = []
-        start, dof, size = {}, {}, 0
+        column, size = {}, 0
         for name, stack in values.items():
             if name in free and np.any(free[name]) and len(stack):
-                start[name], dof[name] = size, stack.dof
-                size += len(stack) * stack.dof
+                column[name] = size + np.arange(len(stack) * stack.dof).reshape(len(stack), stack.dof)
+                size += column[name].size
                 at += [(name, i) for i in range(len(stack))]
-        return Unknowns(tuple(at), start, dof, size)
-
-    def places(self, stack: str, element: int) -> Ints:
-        """Positions of the parameters of one unknown."""
-        return self.start[stack] + element * self.dof[stack] + np.arange(self.dof[stack])
+        return Unknowns(tuple(at), column, size)
 
     def of_several(self, at: Sequence[At]) -> Ints:
         """Positions of the parameters of several unknowns, in order."""
-        return np.concatenate([self.places(*a) for a in at])
+        return np.concatenate([self.column[stack][i] for stack, i in at])
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,11 +108,10 @@ def jacobian(term: Term, values: Values, unknowns: Unknowns) -> tuple[Array, spa
     n, d = line.residuals.shape
     rows, columns, entries = [], [], []
     for part in line.parts:
-        if part.stack not in unknowns.start:
+        if part.stack not in unknowns.column:
             continue
-        dof = part.jacobian.shape[2]
         row = (np.arange(n)[:, None] * d + np.arange(d))[:, :, None]
-        column = unknowns.start[part.stack] + part.index[:, None, None] * dof + np.arange(dof)
+        column = unknowns.column[part.stack][part.index][:, None]
         rows.append(np.broadcast_to(row, part.jacobian.shape).ravel())
         columns.append(np.broadcast_to(column, part.jacobian.shape).ravel())
         entries.append(part.jacobian.ravel())
@@ -158,11 +153,9 @@ def shares(informations: Mapping[str, Array], C: Array, effect: Array) -> dict[s
     return {name: spread @ A @ spread.T for name, A in informations.items()}
 
 
-# The kinds of measurement, named as in reports.
-LENSES, SURVEY, DOTS, SURFACES = "lens calibrations", "survey", "pixels of dots", "screen surfaces"
-CORNERS, FIXED, SCANS = "board corners", "boards on screens", "scans"
-FLAT_BOARDS = "flatness of boards"
-SPOTS, RECORDS, PLACE, FRAMES = "spots", "stand positions", "place of the stand", "screen axes"
+# The kinds of measurement beside those of network.py, named as in reports.
+DOTS, CORNERS = "pixels of dots", "board corners"
+SPOTS, RECORDS, PLACE = "spots", "stand positions", "place of the stand"
 LOST = "positions without a record"
 P_OUTLIER = 1e-4  # probability that a correct measurement is excluded
 P_MISFIT = 1e-3  # p-value of chi-square below which a kind of measurement misfits
@@ -247,12 +240,9 @@ def calibrate_jointly(measured: Measured, *, without: Bools | None = None, start
     rig = rig_of(measured.network.rig, found.values)
     at = [a for a in unknowns.at if a[0] in (INTRINSICS, CAMERAS, SCREENS, BOWS, BEAMS)]
     rows = unknowns.of_several(at)
-    names, T = named_errors(rig, found.values, at)
-    matrix = T @ C[np.ix_(rows, rows)] @ T.T
-    named = np.diagonal(matrix) > 0
     return Joint(
         rig=rig,
-        covariance=RigCovariance(tuple(np.array(names)[named].tolist()), matrix[np.ix_(named, named)]),
+        covariance=named_covariance(rig, found.values, at, C[np.ix_(rows, rows)]),
         values=found.values,
         adjusted=found,
         unknowns=unknowns,
@@ -287,41 +277,18 @@ def free_parameters(measured: Measured) -> dict[str, bool | Bools]:
 def _terms_by_kind(measured: Measured) -> tuple[dict[str, Term], dict[str, tuple[Term, ...]]]:
     """Terms by kind: those whose rows may be excluded, and the others."""
     network, stand = measured.network, measured.stand
-    control_points, s = network.control_points, network.point_observations
-    fisheye = np.array([c.lens == FISHEYE for c in network.rig.cameras.values()], dtype=bool)
     every: dict[str, Term] = {SPOTS: SpotTerm(network.rig, measured.spots)}
-    fixed: dict[str, tuple[Term, ...]] = {}
-    if len(s):
-        every[DOTS] = PointTerm(s.camera_of, s.point_of, s.pixels, np.eye(2) / s.sigma_px[:, None, None], fisheye)
-    if len(control_points):
-        index = np.arange(len(control_points))
-        fixed[SURVEY] = (SurveyTerm(index, control_points.xyz, whitening(control_points.covariance)),)
-        on = control_points.screen_of >= 0
-        if network.off_surface is not None:
-            on = on & ~network.off_surface
-        if on.any():
-            scatter = np.array(
-                [smallest_scatter(network.surface_scatter_m.get(int(k), 0.0)) for k in control_points.screen_of]
-            )
-            fixed[SURFACES] = (SurfaceTerm(control_points.screen_of[on], index[on], scatter[on]),)
+    if len(network.point_observations):
+        every[DOTS] = point_term(network)
     if measured.screens.corners is not None:
         every[CORNERS] = measured.screens.corners
-        fixed[FLAT_BOARDS] = tuple(flat_boards(measured.screens.corners))
-    if network.fixed is not None:
-        fixed[FIXED] = (network.fixed,)
-    if network.screen_priors:
-        fixed[SCANS] = tuple(network.screen_priors)
-    if network.lens_priors:
-        fixed[LENSES] = tuple(network.lens_priors)
+    fixed = stated_terms(network, pose_of(measured.screens.values, SCREENS), measured.screens.corners)
     count = len(stand.stand_from_body.translation)
     sigmas = np.broadcast_to(np.asarray(stand.pose_sigmas, dtype=float), (count, 6))
     if np.any((sigmas > 0) & np.isfinite(sigmas)):
         every[RECORDS] = RecordTerm(POSES, np.arange(count), stand.stand_from_body, sigmas)
     if stand.world_from_stand is not None and stand.stand_covariance is not None and np.any(stand.stand_covariance):
         fixed[PLACE] = (Prior(((STAND, 0),), (Poses.of([stand.world_from_stand]),), stand.stand_covariance),)
-    screens = pose_of(measured.screens.values, SCREENS)
-    if len(screens.translation):
-        fixed[FRAMES] = (FrameTerm(np.arange(len(screens.translation)), screens),)
     return every, fixed
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calibration.changes import ExcessResidual
-from calibration.least_squares.adjustment import At, Linearised, Loss, Part, Values
+from calibration.least_squares.adjustment import At, Linearised, Loss, Part, Values, places
 from calibration.model_check.fault_identification import compressed
 from calibration.model_check.linearised_frames import (
     LinearisedFrames,
@@ -132,13 +132,8 @@ class RecordingTerm:
         reduced = self.reduced(values)
         lost = reduced.lin.used.sum() < self.recording.usable.sum()
         residual = np.append(-reduced.y, np.sqrt(reduced.rest))
-        parts, start = [], 0
-        for stack, i in self.at:
-            dof = values[stack].dof
-            J = np.zeros((len(residual), dof))
-            J[:-1] = reduced.X[:, start : start + dof]
-            parts.append(Part(stack, np.array([i]), J[None]))
-            start += dof
+        slopes = np.append(reduced.X, np.zeros((1, reduced.X.shape[1])), axis=0)
+        parts = [Part(s, np.array([i]), slopes[None, :, own]) for (s, i), own in places(self.at, values).items()]
         return Linearised(np.full_like(residual, np.nan)[None] if lost else residual[None], parts)
 
     def reduced(self, values: Values) -> Reduced:
@@ -163,10 +158,8 @@ class RecordingTerm:
     def moved(self, values: Values, errors: Array) -> Values:
         """The values with these errors (p,) of the unknowns."""
         steps = {s: np.zeros((len(values[s]), values[s].dof)) for s, _ in self.at}
-        start = 0
-        for stack, i in self.at:
-            steps[stack][i] = errors[start : start + values[stack].dof]
-            start += values[stack].dof
+        for (stack, i), own in places(self.at, values).items():
+            steps[stack][i] = errors[own]
         return {**values, **{s: values[s].plus(step) for s, step in steps.items()}}
 
     def slopes(self, values: Values, about: Values) -> tuple[LinearisedFrames, Array]:
@@ -183,14 +176,12 @@ class RecordingTerm:
     def _derivatives(self, model: SpotModel, lin: LinearisedFrames, values: Values) -> Array:
         """d(pixels)/d(unknowns) (K, n, 2, p); 0 for spots that are not used, and for numbers that are not free."""
         d = model.derivatives(lin.poses, of_lens=any(stack == INTRINSICS for stack, _ in self.at))
-        screens = list(self.rig.screens)
-        screen_of = np.array([screens.index(self.rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
         B = lines_in(values).basis[model.beam_of]
         of: dict[str, tuple[Array, Ints]] = {
             INTRINSICS: (np.concatenate([d.pinhole, d.distortion], axis=-1), model.camera_of),
             CAMERAS: (d.camera, model.camera_of),
-            SCREENS: (d.screen, screen_of),
-            BOWS: (d.bow, screen_of),
+            SCREENS: (d.screen, model.screen_of),
+            BOWS: (d.bow, model.screen_of),
             BEAMS: (np.concatenate([d.direction @ B, d.point @ B], axis=-1), model.beam_of),
         }
         if self.recording.velocity_px_s is not None:
@@ -198,16 +189,12 @@ class RecordingTerm:
             of |= {s: (by_clock[..., i : i + 1], model.camera_of) for i, s in enumerate((OFFSETS, ROW_TIMES))}
         used: Bools = np.asarray(lin.used[..., None, None])
         out = np.zeros((*lin.used.shape, 2, sum(values[s].dof for s, _ in self.at)))
-        start = 0
-        for stack, i in self.at:
-            if stack not in of:  # a clock, and no motion that shows it
-                start += values[stack].dof
-                continue
-            block, element_of = of[stack]
-            views = np.flatnonzero(element_of == i)
-            stop = start + values[stack].dof
-            out[:, views, :, start:stop] = np.where(used[:, views], block[:, views], 0.0) * self.free[stack][i]
-            start = stop
+        for (stack, i), own in places(self.at, values).items():
+            if stack in of:  # not a clock without a motion that shows it
+                block, element_of = of[stack]
+                views = np.flatnonzero(element_of == i)
+                part = np.where(used[:, views], block[:, views], 0.0) * self.free[stack][i]
+                out[:, views, :, own[0] : own[-1] + 1] = part
         return out
 
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.changes import USUAL_SIZES, ChangeCandidate, ExcessResidual
-from calibration.least_squares.adjustment import AdjustmentError, At, Limits, Prior, Values, solve
+from calibration.least_squares.adjustment import AdjustmentError, At, Limits, Prior, Values, places, solve
 from calibration.model_check.fault_identification import (
     FittedFault,
     SuspectedFault,
@@ -51,13 +51,14 @@ from calibration.terms.rig_blocks import (
     CAMERAS,
     INTRINSICS,
     SCREENS,
+    named_covariance,
     named_errors,
     names_at,
     prior_of,
     rig_of,
     stacks_of,
 )
-from geometry.arrays import Array, Bools, Ints, finite, skew
+from geometry.arrays import Array, Bools, finite, skew
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
@@ -117,7 +118,7 @@ class MovedParts:
         """Each part as the one that has moved, and each lens as the wrong one."""
         wider = self._selection()
         moves = possible_moves(self.rig, self.values, self.prior, self.known)
-        model, at = SpotModel.of(self.rig), _places(self._at, self.values)
+        model, at = SpotModel.of(self.rig), places(self._at, self.values)
         out = [replace(fault, directions=wider @ fault.directions) for fault in moves]
         for i, (name, camera) in enumerate(self.rig.cameras.items()):
             if not (views := model.camera_of == i).any():
@@ -146,8 +147,8 @@ class MovedParts:
         lenses = self.free.get(INTRINSICS, np.zeros((len(self.rig.cameras), values[INTRINSICS].dof), dtype=bool)).copy()
         lenses[:, :2] = True
         terms = [replace(t, free={**self.free, INTRINSICS: lenses}) for t in self.terms]
-        places = _places(terms[0].at, values)
-        order = np.concatenate([places[a] for a in self._at])
+        own = places(terms[0].at, values)
+        order = np.concatenate([own[a] for a in self._at])
         return [replace(d, X=d.X[:, order]) for d in (t.reduced(values) for t in terms)]
 
     def _alone(
@@ -219,11 +220,10 @@ def difference(prior: Prior, values: Values) -> Array:
 
 def possible_moves(rig: Rig, values: Values, prior: Prior, known: Knowledge) -> list[PossibleFault]:
     """Every camera, screen and beam as the one that has changed by more than its stated sigma."""
-    model, place = SpotModel.of(rig), _places(prior.at, values)
+    model = SpotModel.of(rig)
     sigmas = np.sqrt(np.diagonal(known.covariance))
-    screen_of = [rig.spots[s].screen for _, s in model.views]
     out = []
-    for (stack, i), rows in place.items():
+    for (stack, i), rows in places(prior.at, values).items():
         if stack not in (CAMERAS, SCREENS, BEAMS):
             continue
         turn, move = _LARGER * np.median(sigmas[rows[3:]]), _LARGER * np.median(sigmas[rows[:3]])
@@ -243,7 +243,7 @@ def possible_moves(rig: Rig, values: Values, prior: Prior, known: Knowledge) -> 
             of[rows[3:5], 1:] = np.eye(2)
             sizes = np.repeat([max(move, USUAL_SIZES.move_m), max(turn, USUAL_SIZES.turn_rad)], (1, 2))
             component, kind, name = SCREEN, TILTED, list(rig.screens)[i]
-            views = np.array([s == name for s in screen_of])
+            views = model.screen_of == i
         else:
             of[rows] = np.eye(4)
             turn, move = (_LARGER * np.max(sigmas[rows[k]]) for k in (np.s_[:2], np.s_[2:]))
@@ -251,15 +251,6 @@ def possible_moves(rig: Rig, values: Values, prior: Prior, known: Knowledge) -> 
             component, kind, name, views = BEAM, LASER_MOVED, list(rig.beams)[i], model.beam_of == i
         if views.any():
             out.append(PossibleFault(component, name, kind, of, sizes, views))
-    return out
-
-
-def _places(at: Sequence[At], values: Values) -> dict[At, Ints]:
-    """The positions of the numbers of each unknown in the vector of all."""
-    out, start = {}, 0
-    for a in at:
-        out[a] = start + np.arange(values[a[0]].dof)
-        start += values[a[0]].dof
     return out
 
 
@@ -334,7 +325,7 @@ class Refinement:
     def named_changes(self) -> dict[str, float]:
         """The change of each number of the rig, by its name."""
         old, new = stacks_of(self.given), stacks_of(self.rig)
-        steps = [new[s].pick(np.array([i])).minus(old[s].pick(np.array([i])))[0] for s, i in self.at]
+        steps = [new[s].minus(old[s])[i] for s, i in self.at]
         names, T = named_errors(self.given, old, self.at)
         return dict(zip(names, (T @ np.concatenate(steps)).tolist(), strict=True))
 
@@ -399,17 +390,14 @@ def refine(
     given_data = [t.reduced(stacks_of(rig)) for t in terms]
     S, _ = normal_equations(data)
     gain, vectors = np.linalg.eigh(known.root.T @ S @ known.root)
-    names, T = named_errors(rig, values, prior.at)
     directions = known.root @ vectors
     if not for_labels:
         after = _with_curvature(after, known, terms, values, changed)
-    matrix = T @ after.covariance @ T.T
-    named = np.diagonal(matrix) > 0
     moved, lenses = ((), {}) if start is None else MovedParts(rig, prior, terms, free, values, known).found()
     return Refinement(
         given=rig,
         rig=rig_of(rig, {s: v for s, v in values.items() if s in stacks}),
-        covariance=RigCovariance(tuple(np.array(names)[named].tolist()), matrix[np.ix_(named, named)]),
+        covariance=named_covariance(rig, values, prior.at, after.covariance),
         at=prior.at,
         values=values,
         before=known,

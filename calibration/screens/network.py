@@ -28,7 +28,7 @@ from calibration.least_squares.adjustment import (
 )
 from calibration.screens.flatness import smallest_scatter
 from calibration.terms.corners import CornerTerm
-from calibration.terms.rig_blocks import named_errors, rig_of, stacks_of
+from calibration.terms.rig_blocks import named_covariance, rig_of, stacks_of
 from calibration.terms.surveyed import (
     BoardOnScreenTerm,
     FrameTerm,
@@ -39,13 +39,16 @@ from calibration.terms.surveyed import (
     picked,
     whitening,
 )
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, symmetric
 from geometry.camera import FISHEYE, Camera
 from geometry.planes import intersect_plane
 from geometry.pose import Pose
 from geometry.rig import Rig, Screen
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 
+# The kinds of what is stated, named as in reports.
+LENSES, SURVEY, SURFACES = "lens calibrations", "survey", "screen surfaces"
+FIXED, SCANS, FLAT_BOARDS, FRAMES = "boards on screens", "scans", "flatness of boards", "screen axes"
 OUTLIER_SIGMAS = 5.0  # in two dimensions one correct point of 270 000 exceeds it
 WARP_SIGMA_M = 1e-3  # sigma of a board's bend at its edge
 SIGNIFICANT = 0.001  # p-value of chi-square below which the sigmas are increased
@@ -135,15 +138,15 @@ def adjust(network: Network, start: Start) -> NetworkFit:
     corners = None if network.corners is None else _weighted_corners(network, start, values, free)
     rest = _other_terms(network, start, corners)
     used = np.ones(len(network.point_observations), dtype=bool)
-    robust = solve(values, [_point_term(network, used, Cauchy()), *rest], free)
+    robust = solve(values, [point_term(network, used, Cauchy()), *rest], free)
     used = _inliers(network, robust.values, used)
-    found = solve(robust.values, [_point_term(network, used), *rest], free)
+    found = solve(robust.values, [point_term(network, used), *rest], free)
     for _ in range(5):
         now = _inliers(network, found.values, used)
         if np.array_equal(now, used):
             break
         used = now
-        found = solve(found.values, [_point_term(network, used), *rest], free)
+        found = solve(found.values, [point_term(network, used), *rest], free)
     return _fit(network, found, at, used, corners)
 
 
@@ -181,11 +184,22 @@ def _unknowns(network: Network, start: Start) -> tuple[Values, dict[str, bool | 
 
 
 def _other_terms(network: Network, start: Start, corners: CornerTerm | None) -> list[Term]:
+    terms = stated_terms(network, start.world_from_screen, corners)
+    first = [terms.pop(kind, ()) for kind in (LENSES, SCANS, SURVEY, SURFACES, FRAMES)]
+    of_corners = () if corners is None else (corners,)
+    return [t for some in (*first, of_corners, *terms.values()) for t in some]
+
+
+def stated_terms(network: Network, world_from_screen: Pose, corners: CornerTerm | None) -> dict[str, tuple[Term, ...]]:
+    """The terms that hold what is stated of the network, by kind; outliers are not searched in them.
+
+    world_from_screen: the screens' axes keep these directions within their planes.
+    """
     control_points = network.control_points
     every = np.arange(len(control_points))
-    out: list[Term] = [*network.lens_priors, *network.screen_priors]
+    out: dict[str, tuple[Term, ...]] = {}
     if len(control_points):
-        out.append(SurveyTerm(every, control_points.xyz, whitening(control_points.covariance)))
+        out[SURVEY] = (SurveyTerm(every, control_points.xyz, whitening(control_points.covariance)),)
         on = control_points.screen_of >= 0
         if network.off_surface is not None:
             on &= ~network.off_surface
@@ -193,17 +207,21 @@ def _other_terms(network: Network, start: Start, corners: CornerTerm | None) -> 
             [smallest_scatter(network.surface_scatter_m.get(int(s), 0.0)) for s in control_points.screen_of]
         )
         if on.any():
-            out.append(SurfaceTerm(control_points.screen_of[on], every[on], scatter[on]))
-    if len(network.rig.screens):
-        out.append(FrameTerm(np.arange(len(network.rig.screens)), start.world_from_screen))
+            out[SURFACES] = (SurfaceTerm(control_points.screen_of[on], every[on], scatter[on]),)
     if corners is not None:
-        out += [corners, *flat_boards(corners, network.warp_sigma_m)]
+        out[FLAT_BOARDS] = tuple(_flat_boards(corners, network.warp_sigma_m))
     if network.fixed is not None:
-        out.append(network.fixed)
+        out[FIXED] = (network.fixed,)
+    if network.screen_priors:
+        out[SCANS] = network.screen_priors
+    if network.lens_priors:
+        out[LENSES] = network.lens_priors
+    if len(world_from_screen.translation):
+        out[FRAMES] = (FrameTerm(np.arange(len(world_from_screen.translation)), world_from_screen),)
     return out
 
 
-def flat_boards(corners: CornerTerm, sigma_m: float = WARP_SIGMA_M) -> Sequence[Prior]:
+def _flat_boards(corners: CornerTerm, sigma_m: float) -> Sequence[Prior]:
     """The prior that boards are flat to about `sigma_m` at their edges; their bend is estimated."""
     if sigma_m == 0:
         return []
@@ -213,7 +231,8 @@ def flat_boards(corners: CornerTerm, sigma_m: float = WARP_SIGMA_M) -> Sequence[
     return independent("warp", Vectors(np.zeros((count, 3))), sigmas)
 
 
-def _point_term(network: Network, used: Bools, loss: Cauchy | None = None) -> PointTerm:
+def point_term(network: Network, used: Bools | slice = slice(None), loss: Cauchy | None = None) -> PointTerm:
+    """The observations of the control points, or some of them."""
     s = network.point_observations
     whiten = np.eye(2) / s.sigma_px[used, None, None]
     return PointTerm(s.camera_of[used], s.point_of[used], s.pixels[used], whiten, fisheye(network.rig), loss)
@@ -244,7 +263,7 @@ def normalised_residuals(network: Network, values: Values) -> Array:
     """Length of each observation's error in sigmas (n,), of pixel and survey combined."""
     s = network.point_observations
     errors = observation_residuals(network, values)
-    term = _point_term(network, np.ones(len(s), dtype=bool))
+    term = point_term(network)
     at_survey = {**values, "points": Vectors(network.control_points.xyz)}
     line = term.linearise(at_survey)
     J = next(p for p in line.parts if p.stack == "points").jacobian * s.sigma_px[:, None, None]
@@ -274,7 +293,7 @@ def _weighted_corners(network: Network, start: Start, values: Values, free: Mapp
     term = replace(network.corners, loss=Cauchy()) if network.corners is not None else None
     assert term is not None
     everything = [
-        _point_term(network, np.ones(len(network.point_observations), dtype=bool), Cauchy()),
+        point_term(network, loss=Cauchy()),
         *_other_terms(network, start, term),
     ]
     found = solve(values, everything, free)
@@ -302,17 +321,12 @@ def _fit(
     chi2, dof = found.chi2, found.dof
     p_fits = float(chdtrc(dof, chi2)) if dof > 0 else 1.0
     factor = chi2 / dof if dof > 0 and p_fits < SIGNIFICANT else 1.0
-    names, T = named_errors(rig, found.values, list(at))
-    covariance = T @ found.covariance(list(at)) @ T.T * factor
-    # Fixed lens parameters have no error and are omitted.
-    known = np.diagonal(covariance) > 0
-    names = tuple(n for n, k in zip(names, known, strict=True) if k)
-    covariance = covariance[np.ix_(known, known)]
+    named = named_covariance(rig, found.values, at, found.covariance(list(at)))  # without fixed lens parameters
     corner_errors = np.empty((0, 2)) if corners is None else corners.pixels - corners.project(found.values)
     return NetworkFit(
         rig=rig,
         values=found.values,
-        covariance=RigCovariance(names, (covariance + covariance.T) / 2),
+        covariance=RigCovariance(named.names, symmetric(named.matrix * factor)),
         variance_factor=factor,
         dof=dof,
         observation_residuals_px=observation_residuals(network, found.values),

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.least_squares.adjustment import Linearised, Loss, Part, Values
-from calibration.terms.surveyed import array_of, bow_shape, pose_of
+from calibration.terms.surveyed import array_of, bow_shape, bow_slope, pose_of
 from geometry.arrays import Array, Bools, Ints, cross
 from geometry.camera import Projected, project_points_full
 
@@ -246,7 +246,7 @@ class _Placed:
         if radii is not None:
             by_radius[..., :2] = step
             by_radius[..., 0] += stretch[..., 0] * step[:, 0] + stretch[..., 1] * step[:, 1]
-            by_radius[..., 2] += (_bend_slope(from_middle, step) @ warp)[..., 0]
+            by_radius[..., 2] += (bow_slope(from_middle, step) @ warp)[..., 0]
         boards, cameras = pose_of(values, "boards")[placement], pose_of(values, "cameras")[camera]
         in_world = on_board @ np.swapaxes(boards.rotation, 1, 2) + boards.translation[:, None]
         in_camera = in_world @ np.swapaxes(cameras.rotation, 1, 2) + cameras.translation[:, None]
@@ -290,9 +290,3 @@ def single_camera(
         point=point,
         areas_px2=areas_px2,
     )
-
-
-def _bend_slope(from_middle: Array, step: Array) -> Array:
-    """Derivatives (n, k, 3), m, of `bow_shape` at points (n, k, 2) along directions `step` (k, 2)."""
-    x, y, p, q = from_middle[..., 0], from_middle[..., 1], step[:, 0], step[:, 1]
-    return np.stack([2 * x * p, x * q + y * p, 2 * y * q], axis=-1)

@@ -11,7 +11,19 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from calibration.least_squares.adjustment import At, Linearised, Lines, Loss, Part, Poses, Prior, Stack, Values, Vectors
+from calibration.least_squares.adjustment import (
+    At,
+    Linearised,
+    Lines,
+    Loss,
+    Part,
+    Poses,
+    Prior,
+    Stack,
+    Values,
+    Vectors,
+    places,
+)
 from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools, Ints, skew
 from geometry.camera import FISHEYE, Camera, camera_matrix, pinhole_numbers
@@ -115,6 +127,13 @@ def named_errors(rig: Rig, values: Values, at: Sequence[At]) -> tuple[tuple[str,
     return tuple(n for some in names for n in some), T
 
 
+def named_covariance(rig: Rig, values: Values, at: Sequence[At], covariance: Array) -> RigCovariance:
+    """The covariance (q, q) of some unknowns as that of their named numbers; without those that have no error."""
+    names, T = named_errors(rig, values, at)
+    matrix = T @ covariance @ T.T
+    return RigCovariance(names, matrix).part(np.diagonal(matrix) > 0)
+
+
 def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[str, Bools]]:
     """A covariance of rig parameters as a prior on the rig's stacks, and the numbers (k, dof) that are then free.
 
@@ -137,12 +156,8 @@ def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[st
     C += np.diag(_RIDGE * np.diagonal(C))
     known = np.diagonal(C) > 0
     free: dict[str, Bools] = {}
-    start = 0
-    for stack, i in used:
-        dof = values[stack].dof
-        mask = free.setdefault(stack, np.zeros((len(values[stack]), dof), dtype=bool))
-        mask[i] = known[start : start + dof]
-        start += dof
+    for (stack, i), own in places(used, values).items():
+        free.setdefault(stack, np.zeros((len(values[stack]), len(own)), dtype=bool))[i] = known[own]
     picked = tuple(values[s].pick(np.array([i])) for s, i in used)
     return (Prior(tuple(used), picked, C) if known.any() else None), free
 
@@ -206,13 +221,10 @@ class SpotTerm:
     spots: SpotPixels
     loss: Loss | None = None
     _model: SpotModel = field(init=False)  # one view per spot, with arrays (N, 1, ...), because each has its own pose
-    _screen_of: Ints = field(init=False)  # (N,)
     _W: Array = field(init=False)  # (N, 2, 2) whitening matrices
 
     def __post_init__(self) -> None:
         model = SpotModel.of(self.rig)
-        screens = list(self.rig.screens)
-        screen_of = np.array([screens.index(self.rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
         of_spots = model.subset(self.spots.view)
         arrays = {
             f.name: getattr(of_spots, f.name)[:, None]
@@ -221,7 +233,6 @@ class SpotTerm:
         }
         unlimited = np.full_like(arrays["half_size"], np.inf)
         object.__setattr__(self, "_model", replace(of_spots, **{**arrays, "half_size": unlimited}))
-        object.__setattr__(self, "_screen_of", screen_of[self.spots.view])
         object.__setattr__(self, "_W", whiten(self.spots.covariance))
 
     def __len__(self) -> int:
@@ -238,7 +249,7 @@ class SpotTerm:
     def linearise(self, values: Values) -> Linearised:
         """Residuals (N, 2), and their derivatives by all seven stacks; nan where a beam misses its screen."""
         model = self._at(values)
-        beam, camera, screen = model.beam_of[:, 0], model.camera_of[:, 0], self._screen_of
+        beam, camera, screen = model.beam_of[:, 0], model.camera_of[:, 0], model.screen_of[:, 0]
         world_from_stand, stand_from_body = pose_of(values, STAND)[0], pose_of(values, POSES)[self.spots.position]
         d = model.derivatives(world_from_stand @ stand_from_body)
         residuals = self._W @ (d.pixels[:, 0] - self.spots.pixels)[..., None]
@@ -263,7 +274,7 @@ class SpotTerm:
         lens, lines = array_of(values, INTRINSICS), lines_in(values)
         cameras, screens = pose_of(values, CAMERAS), pose_of(values, SCREENS)
         fold = self._folds(lens)
-        screen = self._screen_of[:, None]
+        screen = m.screen_of
         return replace(
             m,
             point=lines.points[m.beam_of],

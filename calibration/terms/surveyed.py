@@ -218,6 +218,12 @@ def bow_shape(on_screen: Array) -> Array:
     return np.stack([x * x, x * y, y * y], axis=-1)
 
 
+def bow_slope(on_screen: Array, step: Array) -> Array:
+    """Derivatives (..., 3), m, of `bow_shape` at points (..., 2 or 3), m, along directions (..., 2 or 3)."""
+    x, y, p, q = on_screen[..., 0], on_screen[..., 1], step[..., 0], step[..., 1]
+    return np.stack([2 * x * p, x * q + y * p, 2 * y * q], axis=-1)
+
+
 def surface_heights(on_screen: Array, bow: Array) -> Array:
     """Heights (...), m, along z, of points (..., 3), m, in the screen frame, above its surface. bow (..., 3), 1/m."""
     return on_screen[..., 2] - np.sum(bow_shape(on_screen) * bow, axis=-1)
@@ -270,12 +276,7 @@ class BoardOnScreenTerm:
             e = np.broadcast_to(np.eye(3)[k], p.shape)
             by_board[:, 1 + k, 3:] += (-g[:, None, :] @ R @ skew(e))[:, 0]
             by_screen[:, 1 + k, 3:] += (g[:, None, :] @ skew(axes[:, k]))[:, 0]
-        x, y = p[:, 0], p[:, 1]
-        by_bow = np.zeros((len(p), 3, 3))
-        by_bow[:, 0] = -bow_shape(p)
-        for k in range(2):
-            X, Y = axes[:, k, 0], axes[:, k, 1]
-            by_bow[:, 1 + k] = -np.stack([2 * x * X, y * X + x * Y, 2 * y * Y], axis=-1)
+        by_bow = -np.concatenate([bow_shape(p)[:, None], bow_slope(p[:, None], axes)], axis=1)
         sigma = np.stack([self.sigma_m, self.tilt_sigma_rad, self.tilt_sigma_rad], axis=1)
         whiten = 1.0 / sigma[..., None]
         return Linearised(

@@ -9,12 +9,12 @@ along the beam have no effect.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array, robust_sigma, symmetric
+from geometry.arrays import Array, Bools, robust_sigma, symmetric
 from geometry.camera import FISHEYE, Camera
 from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.pose import Pose
@@ -36,6 +36,22 @@ class RigCovariance:
 
     names: tuple[str, ...]  # p names, as in the module's docstring; of one part without its place: fx, k1, x_m ...
     matrix: Array  # (p, p), in the parameters' units; may be singular
+
+    def part(self, keep: Sequence[bool] | Bools) -> RigCovariance:
+        """That of some of the p parameters."""
+        rows = np.flatnonzero(keep)
+        return RigCovariance(tuple(self.names[i] for i in rows), self.matrix[np.ix_(rows, rows)])
+
+
+def independent(parts: Iterable[RigCovariance]) -> RigCovariance:
+    """The joint covariance of the parameters of parts without correlations between them."""
+    names: tuple[str, ...] = ()
+    matrix = np.zeros((0, 0))
+    for part in parts:
+        matrix = np.pad(matrix, (0, len(part.names)))
+        matrix[len(names) :, len(names) :] = part.matrix
+        names += part.names
+    return RigCovariance(names, matrix)
 
 
 def with_variances(covariance: RigCovariance | None, variances: Mapping[str, float]) -> RigCovariance:
@@ -87,16 +103,10 @@ def is_known(rig: Rig, name: str) -> bool:
 
 def perturbed_camera(camera: Camera, change: Mapping[str, float]) -> Camera:
     """The camera with some parameters, by their names without its own, changed by so much."""
-
-    def of(names: Sequence[str]) -> Array:
-        return np.array([change.get(name, 0.0) for name in names])
-
-    d = of(PINHOLE)
+    d = _changes_of(change, PINHOLE)
     matrix = camera.matrix + np.array([[d[0], 0, d[2]], [0, d[1], d[3]], [0, 0, 0]])
-    distortion = tuple((np.array(camera.distortion) + of(distortion_names(camera))).tolist())
-    moved = of(POSE)
-    pose = camera.camera_from_world
-    place = pose.plus(moved) if moved.any() else pose
+    distortion = tuple((np.array(camera.distortion) + _changes_of(change, distortion_names(camera))).tolist())
+    place = _perturbed_pose(camera.camera_from_world, change)
     clock = {n: getattr(camera, n) + change.get(n, 0.0) for n in CLOCK}
     return replace(camera, matrix=matrix, distortion=distortion, camera_from_world=place, **clock)
 
@@ -153,7 +163,6 @@ class Sensitivity:
         self.names = tuple(names)
         cameras, screens, beams = list(rig.cameras), list(rig.screens), list(rig.beams)
         camera_of = model.camera_of
-        screen_of = np.array([screens.index(rig.spots[s].screen) for _, s in model.views], dtype=np.int64)
         # Per field of SpotDerivatives: indices of parameters, their columns in it, and the views (n, .) they act on.
         self._actions: dict[str, tuple[list[int], list[int], Array]] = {}
         masks: dict[str, list[Array]] = {}
@@ -168,7 +177,7 @@ class Sensitivity:
                 views = camera_of == cameras.index(item)
             elif kind == "screens":
                 field, column = ("bow", BOW.index(parameter)) if parameter in BOW else ("screen", POSE.index(parameter))
-                views = screen_of == screens.index(item)
+                views = model.screen_of == screens.index(item)
             else:
                 is_direction = parameter in DIRECTION
                 field = "direction" if is_direction else "point"
@@ -300,16 +309,9 @@ def uncertainty_tracks(
         if not values[-1] > 0:
             continue
         direction = covariance @ J[i].T @ vectors[:, -1] / np.sqrt(values[-1])
-        moved = world_from_body_moved(world_from_body, np.linspace(-sigmas, sigmas, steps)[:, None] * direction)
+        moved = world_from_body.plus(np.linspace(-sigmas, sigmas, steps)[:, None] * direction)
         out[i] = model.subset(np.array([i])).project(moved)[0][:, 0]
     return out
-
-
-def world_from_body_moved(world_from_body: Pose, deltas: Array) -> Pose:
-    """A stack of poses (k,): one pose changed by each of the pose errors (k, 6)."""
-    k = len(deltas)
-    stack = Pose(np.tile(world_from_body.rotation, (k, 1, 1)), np.tile(world_from_body.translation, (k, 1)))
-    return stack.plus(deltas)
 
 
 def beam_image(rig: Rig, camera: Camera, spot: str, world_from_body: Pose, steps: int = 81) -> Array:

@@ -106,7 +106,7 @@ def circle(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> 
 # `beampose track drogue`: a refuelling drogue, by the learned detector and the light tracker.
 
 
-@click.command()
+@track.command()
 @click.argument("pictures", metavar="VIDEO_OR_FOLDER", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Gets drogue.csv, summary.json and report.html.")
 @_near_option
@@ -145,7 +145,7 @@ def drogue(ctx: click.Context, /, pictures: Path, out: Path, **options: Any) -> 
 # `beampose track point`: the centre of one target.
 
 
-@click.command()
+@track.command()
 @click.argument("source", metavar="VIDEO_OR_FOLDER_OR_CSV", type=ANY_PATH)
 @click.option("--out", required=True, type=FOLDER, help="Gets track.csv, summary.json and report.html.")
 @click.option(
@@ -196,7 +196,7 @@ def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> Non
 # `beampose track lamps`: the pose of a target with lamps.
 
 
-@click.command()
+@track.command()
 @click.argument("pictures", metavar="VIDEO_OR_FOLDER", type=ANY_PATH)
 @click.option(
     "--target",
@@ -285,8 +285,3 @@ def pair(left: Path, right: Path, board: str, out: Path, names: str, lens: str, 
     with progress_bar("photos") as progress:
         outcome = calibrate_pair_folder(left, right, board, out, options, progress=progress)
     conclude(outcome)
-
-
-track.add_command(drogue)
-track.add_command(point)
-track.add_command(lamps)

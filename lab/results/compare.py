@@ -45,16 +45,8 @@ FARTHEST = 1e6  # m, deg: a position, an angle or a sigma beyond it is a mistake
 LATEST_S = 1e12  # 30,000 years: times in ns are beyond it
 
 
-@dataclass(frozen=True, slots=True)
-class ReferenceMotion:
-    """A motion with notes about how its file was read."""
-
-    motion: PoseSeries
-    notes: tuple[str, ...]
-
-
-def read_reference(path: Path, sigma_m: float = 0.0, sigma_deg: float = 0.0) -> ReferenceMotion:
-    """The motion of a file. sigma_m, sigma_deg: standard deviations where the file states none.
+def read_reference(path: Path, sigma_m: float = 0.0, sigma_deg: float = 0.0) -> tuple[PoseSeries, tuple[str, ...]]:
+    """The motion of a file, and notes on how it was read. sigma_m, sigma_deg: sigmas where the file states none.
 
     Raises InputError: no such file, neither format, a field that is not a number, or times that do not rise.
     """
@@ -63,7 +55,7 @@ def read_reference(path: Path, sigma_m: float = 0.0, sigma_deg: float = 0.0) -> 
     motion, notes = _from_tum(path, numbers, sigma_m, sigma_deg) if numbers else _from_csv(path, sigma_m, sigma_deg)
     if not np.any(motion.covariance):
         notes = (*notes, "The reference states no sigmas: it counts as exact.")
-    return ReferenceMotion(motion, notes)
+    return motion, notes
 
 
 def _tum_lines(path: Path) -> list[tuple[int, list[str]]]:
@@ -422,8 +414,7 @@ def compare(
     notes: tuple[str, ...] = ()
     gap = GAP
     if reference is not None:
-        read = read_reference(reference, sigma_m, sigma_deg)
-        theirs, notes = read.motion, read.notes
+        theirs, notes = read_reference(reference, sigma_m, sigma_deg)
     else:
         assert other is not None
         other_frames, theirs, _ = _motion_of(other)

@@ -22,6 +22,7 @@ from lab.errors import InputError
 from lab.files.run.results import POSE_STATUSES, PoseTrack, ResultFolder, read_result_table
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder, atomic_write_bytes
+from lab.files.text.error_text import require_one_of
 from lab.files.text.json_text import plain_value
 from lab.findings.finding import Done
 from lab.packages import needed, versions
@@ -89,8 +90,7 @@ def export(results: Path | str, to: str, out: Path | str | None = None, *, causa
     Raises InputError: no results, an unknown format, a package that is not installed, or a motion that it cannot hold.
     """
     results = Path(results)
-    if to not in FORMATS:
-        raise InputError(f"--to: expected one of {', '.join(FORMATS)}, got {to!r}")
+    require_one_of("--to", to, FORMATS)
     folder = ResultFolder.of_run(results)
     wanted = FORMATS[to]
     path = Path(out) if out is not None else Path(f"{results.resolve().name}{wanted.suffix}")

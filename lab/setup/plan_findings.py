@@ -236,19 +236,16 @@ def budget_lines(plan: Plan) -> list[BudgetLine]:
     elif max(map(abs, rest)) > 1e-3:
         rows.append((CORRELATION, "rig file", *rest))
     lines = [
-        BudgetLine(
-            name=name,
-            source=source,
-            sigma_deg=deg * float(np.sign(share_deg) * np.sqrt(abs(share_deg))),
-            share_deg=share_deg,
-            halved_deg=deg * float(np.sqrt(1 - 0.75 * min(max(share_deg, 0.0), 1.0))),
-            sigma_m=m * float(np.sign(share_m) * np.sqrt(abs(share_m))),
-            share_m=share_m,
-            halved_m=m * float(np.sqrt(1 - 0.75 * min(max(share_m, 0.0), 1.0))),
-        )
+        BudgetLine(name, source, *_part(deg, share_deg), *_part(m, share_m))
         for name, source, share_m, share_deg in rows
     ]
     return sorted(lines, key=lambda line: -line.share_deg)
+
+
+def _part(sigma: float, share: float) -> tuple[float, float, float]:
+    """Of a contribution with a share of the variance: its sigma, the share, and the total sigma if it were halved."""
+    halved = float(np.sqrt(1 - 0.75 * min(max(share, 0.0), 1.0)))
+    return sigma * float(np.sign(share) * np.sqrt(abs(share))), share, sigma * halved
 
 
 def _source(plan: Plan, name: str) -> str:

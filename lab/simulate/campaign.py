@@ -77,15 +77,6 @@ class CampaignQuality:
 
 
 @dataclass(frozen=True, slots=True)
-class LensDraw:
-    """The result of a lens calibration of one camera."""
-
-    camera: Camera  # its lens parameters; the pose is not used
-    names: tuple[str, ...]
-    covariance: Array  # (p, p)
-
-
-@dataclass(frozen=True, slots=True)
 class Campaign:
     """The truth and all measurements."""
 
@@ -94,7 +85,7 @@ class Campaign:
     quality: CampaignQuality
     nominal: Rig  # as drawn
     truth: Rig  # as mounted
-    lenses: dict[str, LensDraw]
+    lenses: dict[str, CameraFile]  # as calibrated
     dot_names: tuple[str, ...]  # n dots
     dot_screen: Ints  # (n,): index into the screens
     dots_surveyed: Array  # (n, 3), m, world
@@ -232,12 +223,13 @@ def lens_covariance(camera: Camera, corner_px: float, views: int = 30) -> Array:
     return solve(values, [term], free).covariance([("intrinsics", 0)])[:used, :used]
 
 
-def _lens(true: Camera, q: CampaignQuality, rng: np.random.Generator) -> LensDraw:
+def _lens(true: Camera, q: CampaignQuality, rng: np.random.Generator) -> CameraFile:
     C = lens_covariance(true, q.lens_corner_px)
     off = np.linalg.cholesky(C) @ rng.normal(size=len(C))
     lens = (np.concatenate([pinhole_numbers(true), true.distortion]) + off).tolist()
-    drawn = replace(true, matrix=camera_matrix(lens[:4]), distortion=tuple(lens[4:]))
-    return LensDraw(drawn, (*PINHOLE, *distortion_names(true)), C)
+    known = RigCovariance((*PINHOLE, *distortion_names(true)), C)
+    state = CameraCalibration(date=datetime.date.fromisoformat(_DATE), verdict="PASS", notes="simulated")
+    return CameraFile(true.name, true.image_size_px, camera_matrix(lens[:4]), tuple(lens[4:]), true.lens, known, state)
 
 
 def _dots(rig: Rig, q: CampaignQuality) -> tuple[tuple[str, ...], Ints, Array]:
@@ -263,21 +255,18 @@ def _dots(rig: Rig, q: CampaignQuality) -> tuple[tuple[str, ...], Ints, Array]:
 
 def _observations(rig: Rig, of_screen: Ints, dots: Array) -> tuple[Ints, Ints, Array]:
     """Camera, dot and pixel of each observation; each camera sees the dots of its own screen."""
-    camera_of, dot_of, pixels = [], [], []
-    screens = list(rig.screens)
+    parts, screens = [], list(rig.screens)
     for c, camera in enumerate(rig.cameras.values()):
         uv = camera.project(dots)
-        for d in np.flatnonzero(_in(camera, uv) & (of_screen == screens.index(camera.screen))):
-            camera_of.append(c)
-            dot_of.append(int(d))
-            pixels.append(uv[d])
-    return np.array(camera_of, dtype=np.int64), np.array(dot_of, dtype=np.int64), np.array(pixels).reshape(-1, 2)
+        seen = np.flatnonzero(_in(camera, uv) & (of_screen == screens.index(camera.screen)))
+        parts.append((np.full(len(seen), c), seen, uv[seen]))
+    camera_of, dot_of, pixels = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return camera_of, dot_of, pixels
 
 
 def _in(camera: Camera, pixels: Array) -> Bools:
     size = np.array([camera.image_size_px], dtype=float)
-    inside: Bools = in_picture(pixels, size, -_EDGE_PX)
-    return inside
+    return in_picture(pixels, size, -_EDGE_PX)
 
 
 def _some_wrong(pixels: Array, share: float, rng: np.random.Generator) -> tuple[Bools, Array]:
@@ -344,7 +333,7 @@ def _designed(rig: str) -> Rig:
 def write_campaign(c: Campaign, folder: Path) -> None:
     """Write the files of a campaign into an existing folder."""
     for name, lens in c.lenses.items():
-        save_camera(_camera_file(name, lens), folder / f"camera-{name}.yaml")
+        save_camera(lens, folder / f"camera-{name}.yaml")
     screens = list(c.truth.screens)
     survey = [
         (name, *_metres(xyz), *[_short(c.quality.survey_m)] * 3, screens[k])
@@ -405,13 +394,6 @@ def _project(c: Campaign) -> dict[str, Any]:
     out["recordings"] = [{"spots": "spots.csv", "poses": "poses.csv"}]
     out["notes"] = f"simulated: seed {c.seed}; the truth is in truth/"
     return out
-
-
-def _camera_file(name: str, lens: LensDraw) -> CameraFile:
-    c = lens.camera
-    covariance = RigCovariance(lens.names, lens.covariance)
-    state = CameraCalibration(date=datetime.date.fromisoformat(_DATE), verdict="PASS", notes="simulated")
-    return CameraFile(name, c.image_size_px, c.matrix, c.distortion, c.lens, covariance, state)
 
 
 def _write_photos(c: Campaign, folder: Path) -> None:

@@ -155,13 +155,11 @@ _LEAST_SIGMA_PX = 1e-3  # stated sigma of noise-free detections, so that their w
 class PointRun:
     """T frames, n views (camera and spot, in the order of model.views), c cameras."""
 
-    name: str
     seed: int
     rig: Rig
     model: SpotModel
     prior: PriorRegion
     noise_px: float  # 1 sigma per axis of each detection
-    frame_rate_hz: float
     frame: Ints  # (T,) 0, 1, ...
     t_s: Array  # (T,)
     poses: Pose  # (T,) true world_from_body
@@ -214,13 +212,11 @@ def points_of(scene: Scene, noise_px: float) -> PointRun:
         detections.append(tuple(Detections.at(uv[r], np.tile(covariance, (len(r), 1, 1))) for r in rows))
         origins.append(tuple(of[r] for r in rows))
     return PointRun(
-        name=scene.scenario.name,
         seed=scene.seed,
         rig=scene.rig,
         model=model,
         prior=scene.scenario.prior,
         noise_px=noise_px,
-        frame_rate_hz=scene.scenario.frame_rate_hz,
         frame=scene.frame,
         t_s=scene.t_s,
         poses=scene.poses,

@@ -17,6 +17,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
+from lab.files.text.error_text import require_one_of
 from lab.simulate.scenarios import RIGS, SCENARIOS, AnyMotion, Scenario, scaled, with_noise
 
 # Every random number comes from a generator seeded by (seed, purpose, frame, ...): frame 7 is the same in a recording
@@ -67,8 +68,7 @@ def scenario_named(scenario: str | Scenario) -> Scenario:
     """The scenario of this name. Raises InputError: no scenario has this name."""
     if isinstance(scenario, Scenario):
         return scenario
-    if scenario not in SCENARIOS:
-        raise InputError(f"scenario: expected one of {', '.join(SCENARIOS)}, got {scenario!r}")
+    require_one_of("scenario", scenario, SCENARIOS)
     return SCENARIOS[scenario]
 
 

@@ -28,6 +28,7 @@ from lab.files.run.truth import read_true_poses, write_true_poses
 from lab.files.text import columns
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.csv_text import write_table
+from lab.files.text.error_text import require_one_of
 from lab.pictures.picture_file import GreyPicture
 from lab.progress import Progress
 from lab.simulate.picture import LaserPowers, Sensor, laser_powers, make_sensor, render
@@ -263,8 +264,7 @@ def _with_light(scenario: Scenario, light: str | None) -> Scenario:
     """The scenario with a light of LIGHTS; None: with its own."""
     if light is None:
         return scenario
-    if light not in LIGHTS:
-        raise InputError(f"light: expected one of {', '.join(LIGHTS)}, got {light!r}")
+    require_one_of("light", light, LIGHTS)
     return replace(scenario, light=LIGHTS[light])
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from geometry.arrays import Array
 from lab.errors import InputError
+from lab.files.text.error_text import require_one_of
 from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_number, format_percent
 from lab.progress import Progress
@@ -57,10 +58,9 @@ class CircleOptions(TrackOptions):
             raise InputError(
                 f"--max-radius: expected more than --min-radius ({self.min_radius_px:g} px), got {self.max_radius_px:g}"
             )
-        choices = ("form", self.form, FORMS), ("detector", self.detector, tuple(DETECTORS)), ("edge", self.edge, EDGES)
-        for option, value, known in choices:
-            if value not in known:
-                raise InputError(f"--{option}: expected one of {', '.join(known)}, got {value!r}")
+        require_one_of("--form", self.form, FORMS)
+        require_one_of("--detector", self.detector, DETECTORS)
+        require_one_of("--edge", self.edge, EDGES)
         return CircleParameters(self.min_radius_px, self.max_radius_px, Edge(self.edge))
 
     def tracker(self) -> Tracker:

@@ -16,6 +16,7 @@ from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.text.csv_text import number_fields
 from lab.files.text.dataclass_fields import with_overrides
+from lab.files.text.error_text import require_one_of
 from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_number, format_percent, format_some
 from lab.pictures.picture_file import MissingPicture
@@ -71,8 +72,7 @@ class PointOptions(TrackOptions):
 
     def settings(self) -> PointSettings:
         """The parameters. Raises InputError: an override is not one of them, or the detector does not exist."""
-        if self.detector not in DETECTORS:
-            raise InputError(f"--detector: expected one of {', '.join(DETECTORS)}, got {self.detector!r}")
+        require_one_of("--detector", self.detector, DETECTORS)
         made = with_overrides(PointSettings(), self.overrides)
         track = made.track if self.near_px is None else replace(made.track, start_px=self.near_px)
         polarity: Any = self.detector if self.detector in ("darker", "brighter") else made.blobs.polarity

@@ -16,7 +16,7 @@ from geometry.arrays import Array, Ints
 from lab.errors import InputError
 from lab.files.run.detections_file import is_too_sparse, read_detections
 from lab.files.text.csv_text import read_table
-from lab.files.text.error_text import name_of_path
+from lab.files.text.error_text import name_of_path, require_one_of
 from lab.pictures.delivery import Delivery, without_repeats
 from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.pictures.source import PictureFiles, PictureSource, Video, pictures
@@ -158,8 +158,7 @@ def read_points(path: Path, rate_hz: float | None, camera: str | None) -> tuple[
     if camera is None and len(names) > 1:
         raise InputError(f"{path}: expected points of one camera, got {', '.join(names)}; choose one with --camera")
     chosen = names[0] if camera is None else camera
-    if chosen not in file.cameras:
-        raise InputError(f"--camera: expected one of {', '.join(names)}, got {chosen!r}")
+    require_one_of("--camera", chosen, names)
     points = file.cameras[chosen]
     if is_too_sparse(file.last - file.first + 1, len(points.frames)):
         raise InputError(

@@ -202,13 +202,11 @@ def recording_of(
         detections.append(tuple(Detections.at(noisy[k, r], np.tile(cov, (len(r), 1, 1))) for r in rows))
         origin.append(tuple(rows))
     return PointRun(
-        name="made for a test",
         seed=seed,
         rig=rig,
         model=model,
         prior=prior,
         noise_px=noise_px,
-        frame_rate_hz=float(1 / np.median(np.diff(t_s))),
         frame=np.arange(frames),
         t_s=t_s,
         poses=poses,

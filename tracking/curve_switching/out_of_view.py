@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.arrays import Array
-from geometry.forward_model import SpotModel
-from geometry.planes import common_perpendicular, intersect_plane, screen_to_world
+from geometry.forward_model import SpotModel, points_on_screens
+from geometry.planes import common_perpendicular
 from geometry.pose_solver.closed_form import meeting_point, middle_spot, outer_spot
 from geometry.rig import Rig
 
@@ -72,7 +72,7 @@ def quadratic_positions(rig: Rig, model: SpotModel, coplanar_views: CoplanarView
         required = [r.first, r.second, r.first_opposite, r.second_opposite]
         if not np.isnan(uv_px[r.target, 0]) or np.isnan(uv_px[required, 0]).any() or not np.isnan(out[r.target, 0]):
             continue
-        world = _on_screens(rig, model, uv_px) if world is None else world
+        world = points_on_screens(rig, np.arange(len(model)), uv_px) if world is None else world
         A, B, A2, B2 = (world[v] for v in required)
         O = meeting_point(A, A - A2, B, B - B2)
         camera = rig.cameras[model.views[r.target][0]]
@@ -126,15 +126,3 @@ def _construction(model: SpotModel, target: int, a: int, b: int, opposite: dict[
     if 0 < at_t < at_b < np.pi / 2:
         return Construction(target, a, b, *ends, True, at_t, at_b - at_t)
     return None
-
-
-def _on_screens(rig: Rig, model: SpotModel, uv_px: Array) -> Array:
-    """World points (n, 3), m, on the screens, of the views' pixels (n, 2); nan where the pixel is nan."""
-    out = np.full((len(model), 3), np.nan)
-    for c, name in enumerate(model.camera_names):
-        rows = np.flatnonzero((model.camera_of == c) & ~np.isnan(uv_px[:, 0]))
-        camera = rig.cameras[name]
-        screen = rig.screens[camera.screen].world_from_screen
-        origin, rays = camera.rays(uv_px[rows])
-        out[rows] = screen_to_world(intersect_plane(origin, rays, screen), screen)
-    return out

@@ -25,7 +25,7 @@ from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import check_step
 from tracking.labelling.first_labels import NO_POINT, find_labels
 from tracking.parameters import TrackerParameters
-from tracking.statuses import Event, SpotStatus, TrackedFrame
+from tracking.statuses import Event, SpotStatus, TrackedFrame, view_statuses
 
 EAGER_SEARCHES = 10  # frames without a pose in which the labels are searched every time, and then only ...
 SEARCH_EVERY = 5  # ... in every fifth: a search that has failed for long is likely to fail again
@@ -219,7 +219,7 @@ class SpotTracker:
         return TrackedFrame(
             uv_px=uv,
             cov_px2=np.where(unknown[:, None, None], np.nan, cov),
-            status=tuple(status),
+            status=status,
             predicted_px=predicted,
             gain=np.where(seen, matches.gain, np.nan),
             point=point,
@@ -295,27 +295,15 @@ class SpotTracker:
         uv: Array,
         exists: Bools,
         fit: PoseFit | None,
-    ) -> list[SpotStatus]:
+    ) -> tuple[SpotStatus, ...]:
         """The status of every view."""
         model, t = self.model, self.tracks
-        inside: Bools = model.in_picture(uv)
-        no_position: Bools = np.asarray(np.isnan(uv).any(axis=-1))
         known_pose = fit is not None or self.vehicle.known
-        out: list[SpotStatus] = []
-        for i in range(len(model)):
-            if seen[i]:
-                out.append(SpotStatus.TURNED if turned[i] else SpotStatus.MATCHED)
-            elif not self._labelled:
-                out.append(SpotStatus.LOST)
-            elif known_pose and not exists[i]:
-                out.append(SpotStatus.OFF_SCREEN)
-            elif no_position[i] or not (t.alive[i] and (known_pose or t.unseen_s[i] <= self.parameters.max_coast_s)):
-                out.append(SpotStatus.LOST)
-            elif found[int(model.camera_of[i])] is None:
-                out.append(SpotStatus.NO_IMAGE)
-            else:
-                out.append(SpotStatus.OCCLUDED if inside[i] else SpotStatus.OUT_OF_VIEW)
-        return out
+        exists = exists | (not known_pose)
+        followed = t.alive & (known_pose | (t.unseen_s <= self.parameters.max_coast_s)) & ~np.isnan(uv).any(axis=-1)
+        known = self._labelled & (followed | ~exists)
+        has_image = np.array([f is not None for f in found])[model.camera_of]
+        return view_statuses(seen, turned, exists, model.in_picture(uv), has_image, known)
 
 
 def _with_merged_spots(fit: PoseFit | None, uv: Array, cov: Array, seen: Bools) -> Array:

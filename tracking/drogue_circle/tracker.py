@@ -144,7 +144,8 @@ def _fitted(
     for c in candidates:
         if len(tried) >= _MOST_FITTED:
             break
-        if not _may_be(c, wanted) or any(_is_near(c, t) for t in tried):
+        coarse = c.u_px, c.v_px, c.radius_px, c.polarity
+        if not _may_be(*coarse, wanted, 0.3 * c.radius_px + 4, 1.3) or any(_is_near(c, t) for t in tried):
             continue
         tried.append(c)
         half = 1.3 * c.radius_px + 10
@@ -158,7 +159,7 @@ def _fitted(
             fit is not None
             and p.min_radius_px <= fit.rim.radius_px <= largest
             and is_certain(fit)
-            and _fits(fit, wanted)
+            and _may_be(*fit.circle, fit.polarity, wanted)
         ):
             fits.append(fit)
     return fits
@@ -200,29 +201,16 @@ def is_certain(fit: RimFit, largest_rms: tuple[float, float, float] = _LARGEST_R
     return bool(2 * np.pi * seen_px / CORRELATED_PX >= _LEAST_POINTS and fit.rms_px <= largest)
 
 
-def _may_be(c: CircleCandidate, wanted: Wanted) -> bool:
-    """Whether a coarse circle may be the wanted one, with a margin for its errors."""
-    if wanted.near_px is not None:
-        away = np.hypot(c.u_px - wanted.near_px[0], c.v_px - wanted.near_px[1])
-        if away > wanted.within_px + 0.3 * c.radius_px + 4:
-            return False
-    if wanted.radius_px is not None and not _within(c.radius_px / wanted.radius_px, 1.3 * wanted.radius_factor):
+def _may_be(
+    u_px: float, v_px: float, radius_px: float, polarity: int, wanted: Wanted, off_px: float = 0.0, ratio: float = 1.0
+) -> bool:
+    """Whether a circle may be the wanted one. off_px, ratio: errors of a coarse centre and radius."""
+    near, factor = wanted.near_px, ratio * wanted.radius_factor
+    if near is not None and np.hypot(u_px - near[0], v_px - near[1]) > wanted.within_px + off_px:
         return False
-    return not (wanted.polarity and c.polarity and c.polarity != wanted.polarity)
-
-
-def _fits(fit: RimFit, wanted: Wanted) -> bool:
-    if wanted.near_px is not None:
-        away = np.hypot(fit.rim.u_px - wanted.near_px[0], fit.rim.v_px - wanted.near_px[1])
-        if away > wanted.within_px:
-            return False
-    if wanted.radius_px is not None and not _within(fit.rim.radius_px / wanted.radius_px, wanted.radius_factor):
+    if wanted.radius_px is not None and not 1 / factor <= radius_px / wanted.radius_px <= factor:
         return False
-    return not wanted.polarity or fit.polarity == wanted.polarity
-
-
-def _within(ratio: float, factor: float) -> bool:
-    return 1 / factor <= ratio <= factor
+    return not wanted.polarity or polarity in (0, wanted.polarity)
 
 
 def _is_near(c: CircleCandidate, other: CircleCandidate) -> bool:

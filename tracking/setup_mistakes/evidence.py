@@ -21,7 +21,7 @@ from tracking.labelling.points import NO_POINT
 from tracking.labelling.search import Labelling, candidate_labellings
 from tracking.parameters import LabelParameters
 from tracking.resting_points import NOWHERE, Three, at_places, resting_places
-from tracking.setup_mistakes.possible import FEW_POSES, HERE, Block, Mistake, possible_mistakes
+from tracking.setup_mistakes.possible import FEW_POSES, HERE, Block, Mistake, effect_on, possible_mistakes
 
 # How well a rig explains sampled frames of a recording, and which mistake explains them better.
 #
@@ -128,10 +128,11 @@ def compare(
     # Of a rig that few poses of the prior let see enough spots, the same says nothing about a mistake.
     few = parameters.min_spots
     often = _may_see(rig, frames.prior, few)
+    has_effect = effect_on(rig, outside=not often)
     left: list[tuple[Mistake, Explained | None]] = [
         (m, None)
         for m in possible_mistakes(rig, frames.prior)
-        if (m.rig is rig or (m.has_effect(rig, not often) and (not often or _may_see(m.rig, frames.prior, few))))
+        if (m.rig is rig or (has_effect(m) and (not often or _may_see(m.rig, frames.prior, few))))
         and (m.prior is not None or not certain)
     ]
     whole: list[tuple[Mistake, Explained]] = []
@@ -360,9 +361,10 @@ def invisible_mistakes(
     beside = np.outer((0.0, *STEPS), BESIDE)
     poses = poses_within(prior, POSES) if first is None else first.plus(beside)
     views = np.count_nonzero(model.in_picture(model.project(poses)[0]).any(axis=0))
+    has_effect = effect_on(rig)
     for mistake in possible_mistakes(rig):
         late = any(change.later for change in mistake.pictures.values())
-        if mistake.by_itself or late or not (mistake.kind == NAMES or mistake.has_effect(rig)):
+        if mistake.by_itself or late or not (mistake.kind == NAMES or has_effect(mistake)):
             continue
         true = SpotModel.of(mistake.rig)
         pixels, jacobian = true.project(poses)

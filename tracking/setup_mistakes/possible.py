@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, permutations
 from types import MappingProxyType
@@ -58,17 +58,6 @@ class Mistake:
     by_itself: bool = False  # numbers of the files show it, without a recording
     beams: tuple[str, ...] = ()  # whose spots it changes
 
-    def has_effect(self, given: Rig, outside: bool = False) -> bool:
-        """Whether the mistake changes more than names: the pictures, the prior, or the points of some pose.
-
-        outside: also points outside the pictures, of a rig that few poses let see its spots.
-        """
-        if self.pictures or self.prior is not None or self.by_itself:
-            return True
-        poses = poses_within(assumed_range(given), FEW_POSES)
-        frames = zip(_points_of(self.rig, poses, outside), _points_of(given, poses, outside), strict=True)
-        return not all(np.array_equal(a, b) for a, b in frames)
-
     def counterparts(self, given: Rig) -> tuple[Mistake, Mistake]:
         """Of wrong numbers of one camera: frames as given and without the mistake, with its pictures exchanged.
 
@@ -108,6 +97,21 @@ class Mistake:
             if found is not None:
                 out[name] = found
         return out
+
+
+def effect_on(given: Rig, outside: bool = False) -> Callable[[Mistake], bool]:
+    """Whether a mistake changes more than names: the pictures, the prior, or the points of some pose.
+
+    outside: also points outside the pictures, of a rig that few poses let see its spots.
+    """
+    poses = poses_within(assumed_range(given), FEW_POSES)
+    unchanged = _points_of(given, poses, outside)
+
+    def has_effect(m: Mistake) -> bool:
+        stated = m.pictures or m.prior is not None or m.by_itself
+        return bool(stated) or not all(map(np.array_equal, _points_of(m.rig, poses, outside), unchanged))
+
+    return has_effect
 
 
 def _points_of(rig: Rig, poses: Pose, outside: bool) -> list[Array]:

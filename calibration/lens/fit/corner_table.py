@@ -94,24 +94,16 @@ class CornerTable:
         number[views] = np.arange(len(views))
         mine = np.flatnonzero(number[self.view] >= 0)
         order = mine[np.argsort(number[self.view[mine]], kind="stable")]
-        return CornerTable(
-            number[self.view[order]],
-            self.point[order],
-            self.pixels[order],
-            self.board_points,
-            self.middle,
-            len(views),
-            self.image_size_px,
-            self._circles_of(order),
-            None if self.sigmas_px is None else self.sigmas_px[order],
-            None if self.picture_noise is None else self.picture_noise[order],
-            None if self.view_noise is None else self.view_noise[views],
-        )
 
-    def _circles_of(self, rows: Ints) -> CircleAreas | None:
-        if self.circles is None or self.circles.areas_px2 is None:
-            return self.circles
-        return replace(self.circles, areas_px2=self.circles.areas_px2[rows])
+        def some(values: Array | None, rows: Ints = order) -> Array | None:
+            return None if values is None else values[rows]
+
+        return replace(
+            self, view=number[self.view[order]], point=self.point[order], pixels=self.pixels[order], views=len(views),
+            circles=None if self.circles is None else replace(self.circles, areas_px2=some(self.circles.areas_px2)),
+            sigmas_px=some(self.sigmas_px), picture_noise=some(self.picture_noise),
+            view_noise=some(self.view_noise, views),
+        )  # fmt: skip
 
     @property
     def spacing_m(self) -> float:

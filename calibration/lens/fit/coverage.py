@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -82,12 +83,8 @@ def _gaps(pixels: Array, size: tuple[int, int]) -> tuple[str, ...]:
     }
     empty = [name for name, share in sides.items() if share > _NEAR_SIDE]
     diagonal = np.hypot(width, height)
-    for name, x, y in (
-        ("top left corner", 0, 0),
-        ("top right corner", width, 0),
-        ("bottom left corner", 0, height),
-        ("bottom right corner", width, height),
-    ):
+    for (row, y), (column, x) in product((("top", 0), ("bottom", height)), (("left", 0), ("right", width))):
+        name = f"{row} {column} corner"
         side_is_empty = any(word in name for side in empty for word in side.split()[:1])
         if not side_is_empty and np.hypot(u - x, v - y).min() / diagonal > _NEAR_CORNER:
             empty.append(name)

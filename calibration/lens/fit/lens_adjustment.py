@@ -13,7 +13,6 @@ from calibration.least_squares.adjustment import (
     Anchors,
     Limits,
     Loss,
-    Poses,
     Term,
     Values,
     Vectors,
@@ -24,7 +23,7 @@ from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, lens_of
 from calibration.terms.corners import INTRINSICS_COUNT, CornerTerm, single_camera
-from calibration.terms.surveyed import array_of
+from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools
 
 CONVERGED = Limits()
@@ -77,9 +76,7 @@ def coefficient_prior(
     """
     if model.coefficients <= 5:
         return ()
-    poses = values["boards"]
-    assert isinstance(poses, Poses)
-    xyz = poses.pose[table.view[used]].apply(table.points[used])
+    xyz = pose_of(values, "boards")[table.view[used]].apply(table.points[used])
     with np.errstate(invalid="ignore", divide="ignore"):
         r2 = np.nanquantile(np.sum(xyz[:, :2] ** 2, axis=1) / xyz[:, 2] ** 2, 0.99)
     power = np.array([1, 2, 0, 0, 3, 1, 2, 3, 1, 2, 1, 2, 0, 0])

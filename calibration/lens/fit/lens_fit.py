@@ -9,12 +9,12 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc
 
-from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Poses, Values, Vectors
+from calibration.least_squares.adjustment import Adjusted, Cauchy, Limits, Values, Vectors
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_adjustment import BRIEF, CONVERGED, FitSettings, adjust, term_of, with_circle_radius
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.lens_parameters import BoardFreedom, lens_of
-from calibration.terms.surveyed import array_of
+from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools, Ints, robust_sigma
 from geometry.pose import Pose
 
@@ -76,9 +76,7 @@ class LensFit:
     @property
     def poses(self) -> Pose:
         """camera_from_board of all V views."""
-        stack = self.values["boards"]
-        assert isinstance(stack, Poses)
-        return stack.pose
+        return pose_of(self.values, "boards")
 
     @property
     def covariance(self) -> Array:
@@ -162,9 +160,7 @@ def _spread(residuals: Array) -> float:
 
 
 def _without_pose(table: CornerTable, values: Values) -> dict[int, str]:
-    boards = values["boards"]
-    assert isinstance(boards, Poses)
-    lost = ~np.isfinite(boards.pose.translation).all(axis=1)
+    lost = ~np.isfinite(pose_of(values, "boards").translation).all(axis=1)
     few = table.counts() < FEWEST_CORNERS
     out = {int(v): "no pose of the board explains its corners" for v in np.flatnonzero(lost)}
     return out | {int(v): f"fewer than {FEWEST_CORNERS} corners" for v in np.flatnonzero(few)}

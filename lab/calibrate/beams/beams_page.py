@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from calibration.beams.beams import BeamCalibration, CollinearityTest
 from calibration.beams.error_diagnosis import diagnose_error
-from calibration.beams.spot_fit import swapped_pairs, world_points
+from calibration.beams.spot_fit import swapped_pairs
 from calibration.rig.rig_figures import FEWEST_POSITIONS
 from geometry.arrays import Array, Bools, Ints
+from geometry.forward_model import points_on_screens
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance
@@ -303,8 +304,9 @@ def used_positions(c: BeamCalibration, positions: Sequence[str]) -> list[str]:
 
 def residuals_mm(c: BeamCalibration) -> Array:
     """Distance (N,) on the screen between each measured spot and its prediction, mm."""
-    predicted = replace(c.spots, pixels=c.spots.pixels - c.fit.residuals_px)
-    return 1e3 * np.linalg.norm(world_points(c.rig, c.spots) - world_points(c.rig, predicted), axis=1)
+    both = (c.spots.pixels, c.spots.pixels - c.fit.residuals_px)
+    measured, predicted = (points_on_screens(c.rig, c.spots.view, pixels) for pixels in both)
+    return 1e3 * np.linalg.norm(measured - predicted, axis=1)
 
 
 def difference_from_nominal(c: BeamCalibration, nominal: Rig) -> Array:

@@ -30,7 +30,7 @@ from lab.errors import CalibrationError, InputError
 from lab.files.rig.board_file import load_board_or_text
 from lab.files.rig.camera_file import CameraCalibration, CameraFile, save_camera
 from lab.files.text.csv_text import write_table
-from lab.files.text.error_text import suggest_name
+from lab.files.text.error_text import require_one_of
 from lab.findings.finding import Finding, Level, Outcome, verdict
 from lab.number_format import format_number
 from lab.progress import Progress
@@ -55,13 +55,9 @@ class CameraOptions:
     stretch: str = "auto"  # or on, off: estimation of the board's scale along rows and columns, and of its point errors
 
     def __post_init__(self) -> None:
-        if self.lens not in LENSES:
-            raise InputError(f"lens: expected {', '.join(LENSES)}, got {self.lens!r}{suggest_name(self.lens, LENSES)}")
-        if self.warp not in WARPS:
-            raise InputError(f"warp: expected {', '.join(WARPS)}, got {self.warp!r}{suggest_name(self.warp, WARPS)}")
-        if self.stretch not in WARPS:
-            near = suggest_name(self.stretch, WARPS)
-            raise InputError(f"stretch: expected {', '.join(WARPS)}, got {self.stretch!r}{near}")
+        require_one_of("lens", self.lens, LENSES)
+        require_one_of("warp", self.warp, WARPS)
+        require_one_of("stretch", self.stretch, WARPS)
         if self.distance_m is not None and not (np.isfinite(self.distance_m) and self.distance_m > 0):
             raise InputError(f"distance: expected metres above 0, got {self.distance_m:g}")
         if self.valid_days is not None and self.valid_days < 1:

@@ -24,7 +24,7 @@ from lab.files.rig.board_file import load_board_or_text
 from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.pair_file import PairFile, save_pair_file
 from lab.files.text.csv_text import write_table
-from lab.files.text.error_text import suggest_name
+from lab.files.text.error_text import require_one_of
 from lab.findings.finding import Finding, Level, Outcome, finding, level_above, verdict
 from lab.number_format import format_length, format_number
 from lab.pictures.source import number_of
@@ -137,8 +137,7 @@ class PairOptions:
     valid_days: int = 365
 
     def __post_init__(self) -> None:
-        if self.lens not in LENSES:
-            raise InputError(f"lens: expected {', '.join(LENSES)}, got {self.lens!r}{suggest_name(self.lens, LENSES)}")
+        require_one_of("lens", self.lens, LENSES)
         if self.names[0] == self.names[1]:
             raise InputError(f"names: expected two different names, got {self.names[0]!r} twice")
 

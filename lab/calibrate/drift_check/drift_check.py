@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -308,16 +307,6 @@ COLUMNS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class CheckData:
-    """Measured and predicted pixels of a check, and how they were obtained."""
-
-    comparisons: list[PixelComparison]
-    with_covariance: bool  # whether rig.yaml has a covariance
-    sigma_given: bool  # whether the points' file states sigmas
-    pose_free: bool  # whether the vehicle's pose was fitted
-
-
 _STEP = Step("drift check", (TABLE,))
 
 
@@ -347,17 +336,18 @@ def _solve(
 ) -> Solved[DriftResult]:
     inputs.check()
     file = load_rig_file(rig_path)
-    data = _compare(file, rig_path, inputs, limits)
-    result, findings = judge(file, data, limits, today)
+    compared, notes = _compare(file, rig_path, inputs, limits)
+    pose_free = inputs.run is not None and inputs.pose is None
+    result, findings = judge(file, compared, pose_free, limits, today)
     drifts = ", ".join(f"{c.camera} {_two(c.drift_px)} px / {_two(c.drift_mm)} mm" for c in result.cameras)
     return Solved(
         name="drift check",
         title=f"check of {today.isoformat()}",
         result=result,
-        findings=findings,
+        findings=(*findings, *notes),
         figures=drifts + (f"; not checked: {', '.join(result.unchecked)}" if result.unchecked else ""),
         write=lambda folder: write_drift_table(result.cameras, folder / TABLE),
-        page=lambda: page_of(result, file, data.comparisons, [*earlier, *_rows(result, today)], limits, today),
+        page=lambda: page_of(result, file, compared, [*earlier, *_rows(result, today)], limits, today),
         day=today,
         inputs=[rig_path, *inputs.files()],
     )
@@ -371,46 +361,46 @@ def _two(value: float) -> str:
     return "?" if not np.isfinite(value) else f"{value:.2f}"
 
 
-def _compare(file: RigFile, rig_path: Path, inputs: DriftInputs, limits: DriftLimits) -> CheckData:
-    """Read the measurements and compare them with the prediction by the rig."""
-    covariance = joint_covariance(file.rig, file.covariances, rig_path)
+def _compare(
+    file: RigFile, rig_path: Path, inputs: DriftInputs, limits: DriftLimits
+) -> tuple[list[PixelComparison], list[Finding]]:
+    """Read the measurements and compare them with the prediction by the rig; and what is not known of their errors."""
+    covariance, notes = joint_covariance(file.rig, file.covariances, rig_path), []
+    if covariance is None:
+        what = "rig.yaml has no covariance: the calibration's own errors count as drift here"
+        notes.append(finding("BP-C11", Level.WARN, what))
     if inputs.points is not None:
         known = read_points(inputs.points, inputs.survey, file.rig, limits.point_sigma_px)
-        compared = compare_points(file.rig, known, covariance, inputs.points)
-        return CheckData(compared, covariance is not None, known.sigma_given, pose_free=False)
+        if not known.sigma_given:
+            notes.append(passed(f"the points' file has no sigma_px: {limits.point_sigma_px:g} px is assumed"))
+        return compare_points(file.rig, known, covariance, inputs.points), notes
     assert inputs.run is not None
     still = read_still_spots(inputs.run, file.rig)
     check_at_rest(still, limits.still_px, inputs.run)
     covariance_of_pose = np.diag([limits.pose_sigma_m**2] * 3 + [np.deg2rad(limits.pose_sigma_deg) ** 2] * 3)
     pose = None if inputs.pose is None else (read_still_pose(inputs.pose), covariance_of_pose)
-    compared = [compare_still(file.rig, still, covariance, pose, limits.floor_px, inputs.run)]
-    return CheckData(compared, covariance is not None, sigma_given=True, pose_free=pose is None)
+    return [compare_still(file.rig, still, covariance, pose, limits.floor_px, inputs.run)], notes
 
 
 def judge(
-    file: RigFile, data: CheckData, limits: DriftLimits, today: datetime.date
+    file: RigFile, compared: Sequence[PixelComparison], pose_free: bool, limits: DriftLimits, today: datetime.date
 ) -> tuple[DriftResult, tuple[Finding, ...]]:
-    """Judge a check: the drift of each camera, wrong points and moved lasers, and the findings."""
-    p_each = limits.p_false_alarm / max(len(data.comparisons), 1)
+    """The drift of each camera, wrong points and moved lasers, and the findings. pose_free: the pose was fitted."""
+    p_each = limits.p_false_alarm / max(len(compared), 1)
     cameras: list[CameraDrift] = []
     others: list[OtherChange] = []
     findings = state_findings(file.calibration, today, limits.expiry_warning_days)
-    for one in data.comparisons:
+    for one in compared:
         verdicts = find_changes(one.misfit, one.columns, one.others, p_each)
         drifts = [_camera_drift(file.rig, name, one, verdicts, limits, p_each) for name in one.columns]
         cameras += drifts
         others += [_other(file.rig, one, c) for c in verdicts.changes if c.kind not in CAMERA_KINDS]
-        findings += [f for c in drifts for f in camera_findings(c, limits, data.pose_free)]
+        findings += [f for c in drifts for f in camera_findings(c, limits, pose_free)]
     findings += other_findings(others, limits)
     checked = {c.camera for c in cameras}
     unchecked = tuple(name for name in file.rig.cameras if name not in checked)
     if unchecked:
         findings.append(unchecked_finding(unchecked))
-    if not data.with_covariance:
-        what = "rig.yaml has no covariance: the calibration's own errors count as drift here"
-        findings.append(finding("BP-C11", Level.WARN, what))
-    if not data.sigma_given:
-        findings.append(passed(f"the points' file has no sigma_px: {limits.point_sigma_px:g} px is assumed"))
     return DriftResult(tuple(cameras), tuple(others), unchecked), tuple(findings)
 
 

@@ -34,6 +34,7 @@ from geometry.uncertainty.rig_uncertainty import (
     TIME_OFFSET,
     RigCovariance,
     RigUncertainty,
+    independent,
     is_known,
     split_name,
     unlimited,
@@ -113,9 +114,7 @@ class LabelledRun:
 def with_rig(run: Run, rig: Rig, covariance: RigCovariance) -> Run:
     """The run with another rig, of which it has some cameras."""
     own = replace(rig, cameras={n: rig.cameras[n] for n in run.rig.cameras})
-    rows = [i for i, name in enumerate(covariance.names) if is_known(own, name)]
-    names = tuple(covariance.names[i] for i in rows)
-    known = RigCovariance(names, covariance.matrix[np.ix_(rows, rows)])
+    known = covariance.part([is_known(own, name) for name in covariance.names])
     return replace(run, rig=own, covariance=known, clocks=clocks_in(own, known, run.clocks, run.rig))
 
 
@@ -295,27 +294,19 @@ def stated_covariance(rig: Rig, stated: RigCovariance | None, sigmas: Mapping[st
     that is none, or if nothing is stated at all.
     """
     chosen = _chosen(rig, sigmas)
-    names: list[str] = []
-    blocks: list[Array] = []
+    parts = [_with_sigmas(rig, kind, part, values) for (kind, part), values in chosen.items()]
     if stated is not None:
-        kept = [i for i, n in enumerate(stated.names) if _part_of(n) not in chosen]
-        kept = [i for i in kept if stated.matrix[i, i] > 0]
-        names += [stated.names[i] for i in kept]
-        blocks.append(stated.matrix[np.ix_(kept, kept)])
-    for (kind, part), values in chosen.items():
-        new, block = _block(rig, kind, part, values)
-        names += new
-        blocks.append(block)
-    matrix, offsets = block_diag(*blocks), [f"{CAMERAS}.{name}.{TIME_OFFSET}" for name in rig.cameras]
-    if set(offsets) <= set(names):
-        kept = [i for i, n in enumerate(names) if n != offsets[0]]
-        names, matrix = [names[i] for i in kept], matrix[np.ix_(kept, kept)]
-    if not names:
+        free = zip(stated.names, np.diagonal(stated.matrix), strict=True)
+        parts.insert(0, stated.part([variance > 0 and _part_of(n) not in chosen for n, variance in free]))
+    joint, offsets = independent(parts), [f"{CAMERAS}.{name}.{TIME_OFFSET}" for name in rig.cameras]
+    if set(offsets) <= set(joint.names):
+        joint = joint.part([n != offsets[0] for n in joint.names])
+    if not joint.names:
         raise InputError(
             f"{path}: expected the covariance of its parameters, or sigmas, got neither; write the covariances, or add"
             " options such as --sigma cameras.position_m=0.005 --sigma cameras.rotation_deg=0.2"
         )
-    return RigCovariance(tuple(names), matrix)
+    return joint
 
 
 def _part_of(name: str) -> tuple[str, str]:
@@ -352,20 +343,21 @@ def _chosen(rig: Rig, sigmas: Mapping[str, Any]) -> dict[tuple[str, str], dict[s
     return out
 
 
-def _block(rig: Rig, kind: str, part: str, values: Mapping[str, float]) -> tuple[list[str], Array]:
-    """Names and covariance of one part with these sigmas."""
+def _with_sigmas(rig: Rig, kind: str, part: str, values: Mapping[str, float]) -> RigCovariance:
+    """The covariance of one part with these sigmas."""
     if kind in CLOCK:
-        return [f"{CAMERAS}.{part}.{kind}"], np.array([[values[kind] ** 2]])
+        return RigCovariance((f"{CAMERAS}.{part}.{kind}",), np.array([[values[kind] ** 2]]))
     length, angle = (values[w] for w in _WHAT[kind])
     angle = float(np.deg2rad(angle))
     if kind == BEAMS:
         d = rig.beams[part].direction
         across = np.eye(3) - np.outer(d, d)
-        return [f"beams.{part}.{n}" for n in (*DIRECTION, *POINT)], block_diag(angle**2 * across, length**2 * across)
+        matrix = block_diag(angle**2 * across, length**2 * across)
+        return RigCovariance(tuple(f"beams.{part}.{n}" for n in (*DIRECTION, *POINT)), matrix)
     own = np.diag(np.repeat([length**2, angle**2], 3))
     if kind == CAMERAS:
         pose = rig.cameras[part].camera_from_world
         # The camera turns about its own centre, as in calibration/model_check/faults.py.
         D = np.block([[np.eye(3), -skew(pose.translation)], [np.zeros((3, 3)), pose.rotation.T]])
         own = D @ own @ D.T
-    return [f"{kind}.{part}.{n}" for n in POSE], own
+    return RigCovariance(tuple(f"{kind}.{part}.{n}" for n in POSE), own)

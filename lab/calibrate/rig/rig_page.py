@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.rig.joint import DOTS, FRAMES, LEAST_REDUNDANCY, LOST, P_MISFIT, RECORDS, SPOTS, Joint
+from calibration.rig.joint import DOTS, LEAST_REDUNDANCY, LOST, P_MISFIT, RECORDS, SPOTS, Joint
 from calibration.rig.rig_figures import ExpectedPose, HoldOut, RigCalibration, in_degrees, in_mm
+from calibration.screens.network import FRAMES
 from calibration.terms.rig_blocks import POSES, STAND, lines_in, stacks_of
 from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Bools, Ints, skew
@@ -375,8 +376,8 @@ def _screens(o: CalibratedRig) -> Section | None:
             drawings.append(flatness_map(xy, z, title, size_m=screen.size_m, bow=bent, sigma_m=sigma))
         normal = screen.world_from_screen.rotation[:, 2]
         along = tilt = 0.0
-        if "screens" in joint.unknowns.start:
-            at = joint.unknowns.places("screens", list(joint.rig.screens).index(name))
+        if "screens" in joint.unknowns.column:
+            at = joint.unknowns.column["screens"][list(joint.rig.screens).index(name)]
             C = joint.all_covariance[np.ix_(at, at)]
             along = float(np.sqrt(np.maximum(normal @ C[:3, :3] @ normal, 0.0)))
             tilt = float(np.sqrt(np.maximum(C[3, 3] + C[4, 4], 0.0) / 2))
@@ -400,8 +401,8 @@ def _beams(o: CalibratedRig, nominal: Rig) -> Section:
     off = lines_in(joint.values).minus(lines_in(stacks_of(nominal)))
     pose, unknowns = pose_of(joint.values, STAND)[0], joint.unknowns
     words = ["Each laser in the body frame, the frame of the stand's carriage as its poses were recorded."]
-    if STAND in unknowns.start:
-        at = unknowns.places(STAND, 0)
+    if STAND in unknowns.column:
+        at = unknowns.column[STAND][0]
         C = joint.all_covariance[np.ix_(at, at)]
         mm = ", ".join(
             f"{1e3 * t:.2f} ± {1e3 * s:.2f}" for t, s in zip(pose.translation, np.sqrt(np.diagonal(C)[:3]), strict=True)
@@ -422,7 +423,7 @@ def _cameras(o: CalibratedRig) -> Section:
     before = o.steps.measured.network.rig
     rows = []
     for i, (name, camera) in enumerate(joint.rig.cameras.items()):
-        at = joint.unknowns.places("cameras", i)
+        at = joint.unknowns.column["cameras"][i]
         C = joint.all_covariance[np.ix_(at, at)]
         # The centre c is -R^T t: errors of t act through R^T, and R Exp(theta) gives c - theta x c.
         centre = camera.camera_from_world.inverse().translation
@@ -482,7 +483,5 @@ def _lab(o: CalibratedRig) -> Section:
 
 def _beam_sigmas(joint: Joint) -> tuple[Array, Array]:
     """Sigmas of each beam's direction (rad) and offset (m), RMS over the two axes across the beam."""
-    variances = np.array(
-        [np.diagonal(joint.all_covariance)[joint.unknowns.places("beams", i)] for i in range(len(joint.rig.beams))]
-    )
+    variances = np.diagonal(joint.all_covariance)[joint.unknowns.column["beams"]]
     return np.sqrt(variances[:, :2].mean(axis=1)), np.sqrt(variances[:, 2:].mean(axis=1))

@@ -35,7 +35,7 @@ from calibration.terms.surveyed import BoardOnScreenTerm
 from geometry.arrays import Array, Bools, Ints
 from geometry.pose import Pose
 from geometry.rig import Rig, Screen
-from geometry.uncertainty.rig_uncertainty import RigCovariance
+from geometry.uncertainty.rig_uncertainty import RigCovariance, independent
 from lab.calibrate.camera.photos import as_8_bit
 from lab.errors import CalibrationError, InputError
 from lab.files.project.point_files import Observations, Survey, read_observations, read_point_cloud, read_survey
@@ -295,21 +295,13 @@ def _check_extent(project: Project, survey: Survey, screen_of: Ints) -> None:
 
 def _lens_prior(project: Project, rig: Rig) -> tuple[Prior | None, Bools | None]:
     """Prior on the lens parameters from the camera calibrations, and which parameters are free in the adjustment."""
-    names: list[str] = []
-    blocks: list[Array] = []
-    for name, entry in project.cameras.items():
-        c = entry.lens.covariance
-        if c is not None:
-            names += [f"cameras.{name}.{p}" for p in c.names]
-            blocks.append(c.matrix)
-    if not names:
+    known = {name: entry.lens.covariance for name, entry in project.cameras.items()}
+    joint = independent(
+        RigCovariance(tuple(f"cameras.{name}.{p}" for p in c.names), c.matrix) for name, c in known.items() if c
+    )
+    if not joint.names:
         return None, None
-    joint = np.zeros((len(names), len(names)))
-    at = 0
-    for block in blocks:
-        joint[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    prior, free = prior_of(rig, RigCovariance(tuple(names), joint))
+    prior, free = prior_of(rig, joint)
     return prior, free.get("intrinsics")
 
 

@@ -16,7 +16,7 @@ import pydantic
 
 from geometry import lens
 from geometry.arrays import Array, symmetric
-from geometry.camera import FISHEYE, LENSES, PERSPECTIVE, Camera
+from geometry.camera import FISHEYE, LENSES, PERSPECTIVE, Camera, pinhole_numbers
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import PINHOLE, RigCovariance, distortion_names
 from lab.errors import CalibrationError
@@ -240,31 +240,21 @@ class LensBlock(fields.Block):
         return np.array([[m.fx, 0, m.cx], [0, m.fy, m.cy], [0, 0, 1]])
 
 
-def lens_mapping(
-    image_size_px: tuple[int, int], matrix: Array, distortion: tuple[float, ...], lens_name: str
-) -> dict[str, Any]:
-    """The plain mapping from which a `LensBlock` reads the same numbers. matrix (3, 3), px."""
+def lens_mapping(camera: Camera) -> dict[str, Any]:
+    """The plain mapping from which a `LensBlock` reads the same lens."""
     out: dict[str, Any] = {
-        "image_size_px": [int(v) for v in image_size_px],
-        "camera_matrix": {
-            "fx": float(matrix[0, 0]),
-            "fy": float(matrix[1, 1]),
-            "cx": float(matrix[0, 2]),
-            "cy": float(matrix[1, 2]),
-        },
-        "distortion": [float(v) for v in distortion],
+        "image_size_px": [int(v) for v in camera.image_size_px],
+        "camera_matrix": dict(zip(PINHOLE, map(float, pinhole_numbers(camera)), strict=True)),
+        "distortion": [float(v) for v in camera.distortion],
     }
-    if lens_name != PERSPECTIVE:
-        out["lens"] = lens_name
+    if camera.lens != PERSPECTIVE:
+        out["lens"] = camera.lens
     return out
 
 
 def covariance_mapping(covariance: RigCovariance) -> dict[str, Any]:
     """The plain mapping from which a `CovarianceBlock` reads the same numbers."""
-    return {
-        "parameters": list(covariance.names),
-        "matrix": [plain_floats(row) for row in covariance.matrix],
-    }
+    return {"parameters": list(covariance.names), "matrix": [plain_floats(row) for row in covariance.matrix]}
 
 
 def plain_floats(values: Array) -> list[float]:
@@ -328,7 +318,7 @@ def as_mapping(file: CameraFile) -> dict[str, Any]:
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "name": file.name,
-        **lens_mapping(file.image_size_px, file.camera_matrix, file.distortion, file.lens),
+        **lens_mapping(file.camera()),
     }
     if file.covariance is not None:
         content["covariance"] = covariance_mapping(file.covariance)

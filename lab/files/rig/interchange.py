@@ -169,15 +169,9 @@ def _from_rig(file: RigFile) -> tuple[Read, dict[str, RigCovariance]]:
 
 def _share(covariance: RigCovariance, prefix: str) -> RigCovariance | None:
     """The covariance of the lens parameters: with the prefix, not the pose's; None where there are none."""
-    own = [
-        i
-        for i, name in enumerate(covariance.names)
-        if name.startswith(prefix) and "." not in name[len(prefix) :] and not re.search(r"_(m|rad)$", name)
-    ]
-    if not own:
-        return None
-    names = tuple(covariance.names[i].removeprefix(prefix) for i in own)
-    return RigCovariance(names, covariance.matrix[np.ix_(own, own)])
+    of_lens = re.compile(re.escape(prefix) + r"[^.]*(?<!_m)(?<!_rad)")
+    own = covariance.part([of_lens.fullmatch(n) is not None for n in covariance.names])
+    return RigCovariance(tuple(n.removeprefix(prefix) for n in own.names), own.matrix) if own.names else None
 
 
 def _chosen(models: Sequence[CameraModel], camera: str | None, path: Path, target: str) -> tuple[CameraModel, ...]:

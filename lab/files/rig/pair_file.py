@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import pydantic
 
 from geometry.arrays import symmetric
@@ -114,7 +113,7 @@ def save_pair_file(file: PairFile, path: Path) -> None:
         "schema": SCHEMA,
         "cameras": {
             name: {
-                **lens_mapping(c.image_size_px, c.matrix, c.distortion, c.lens),
+                **lens_mapping(c),
                 "camera_from_world": pose_mapping(c.camera_from_world),
             }
             for name, c in file.cameras.items()
@@ -134,8 +133,5 @@ def of_two_cameras(file: PairFile, names: Sequence[str]) -> tuple[tuple[Camera, 
     if file.covariance is None:
         return chosen, None
     known = {f"cameras.{c.name}.{p}" for c in chosen for p in camera_names(c)}
-    rows = [i for i, name in enumerate(file.covariance.names) if name in known]
-    if not rows:
-        return chosen, None
-    matrix = file.covariance.matrix[np.ix_(rows, rows)]
-    return chosen, RigCovariance(tuple(file.covariance.names[i] for i in rows), matrix)
+    part = file.covariance.part([name in known for name in file.covariance.names])
+    return chosen, part if part.names else None

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import pydantic
 
-from geometry.arrays import Array, symmetric
+from geometry.arrays import symmetric
 from geometry.camera import Camera, SensorNoise
 from geometry.rig import Beam, Rig, Screen, Spot
-from geometry.uncertainty.rig_uncertainty import CLOCK, RigCovariance, is_known, split_name
+from geometry.uncertainty.rig_uncertainty import CLOCK, RigCovariance, independent, is_known, split_name
 from lab.errors import InputError
 from lab.files.rig.camera_file import (
     CalibrationState,
@@ -46,40 +45,25 @@ def joint_covariance(rig: Rig, blocks: Mapping[str, RigCovariance], path: Path |
         used = {TARGET: target}
     else:
         used = dict(blocks)
-    names: list[str] = []
-    pieces: list[Array] = []
+    parts = []
     for where, block in used.items():
-        full = [n if where == TARGET else f"{where}.{n}" for n in block.names]
-        known = [i for i, n in enumerate(full) if is_known(rig, n)]
-        if not known:
-            continue
-        matrix = block.matrix[np.ix_(known, known)]
-        mistake = covariance_error(RigCovariance(tuple(block.names[i] for i in known), matrix))
+        prefix = "" if where == TARGET else f"{where}."
+        known = block.part([is_known(rig, prefix + n) for n in block.names])
+        mistake = covariance_error(known)
         if mistake:
             raise InputError(f"{path}: {where}.covariance.matrix: {mistake}")
-        names += [full[i] for i in known]
-        pieces.append(symmetric(matrix))
-    if not names:
-        return None
-    joint = np.zeros((len(names), len(names)))
-    at = 0
-    for piece in pieces:
-        joint[at : at + len(piece), at : at + len(piece)] = piece
-        at += len(piece)
-    return RigCovariance(tuple(names), joint)
+        parts.append(RigCovariance(tuple(prefix + n for n in known.names), symmetric(known.matrix)))
+    joint = independent(parts)
+    return joint if joint.names else None
 
 
 def covariance_blocks(covariance: RigCovariance) -> dict[str, RigCovariance]:
     """A joint covariance as blocks of a rig.yaml: complete for the target, an excerpt for each camera and screen."""
     out: dict[str, RigCovariance] = {}
-    of: dict[str, list[int]] = {}
-    for i, name in enumerate(covariance.names):
-        kind, thing, _ = split_name(name)
-        if kind in ("cameras", "screens"):
-            of.setdefault(f"{kind}.{thing}", []).append(i)
-    for where, rows in of.items():
-        names = tuple(split_name(covariance.names[i])[2] for i in rows)
-        out[where] = RigCovariance(names, symmetric(covariance.matrix[np.ix_(rows, rows)]))
+    things = [".".join(split_name(n)[:2]) for n in covariance.names]
+    for where in dict.fromkeys(t for t in things if t.startswith(("cameras.", "screens."))):
+        own = covariance.part([t == where for t in things])
+        out[where] = RigCovariance(tuple(split_name(n)[2] for n in own.names), symmetric(own.matrix))
     out[TARGET] = RigCovariance(covariance.names, symmetric(covariance.matrix))
     return out
 
@@ -355,15 +339,10 @@ def camera_mapping(camera: Camera) -> dict[str, Any]:
     """The plain mapping from which a `CameraBlock` reads the same camera."""
     out: dict[str, Any] = {
         "screen": camera.screen,
-        **lens_mapping(camera.image_size_px, camera.matrix, camera.distortion, camera.lens),
+        **lens_mapping(camera),
         "camera_from_world": pose_mapping(camera.camera_from_world),
     }
     if camera.noise is not None:
-        n = camera.noise
-        out["noise"] = {
-            "gain_e_per_dn": float(n.gain_e_per_dn),
-            "read_noise_e": float(n.read_noise_e),
-            "black_dn": float(n.black_dn),
-        }
+        out["noise"] = {name: float(value) for name, value in asdict(camera.noise).items()}
     out |= {n: getattr(camera, n) for n in CLOCK if getattr(camera, n)}
     return out

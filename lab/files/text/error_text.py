@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 from lab.errors import InputError
@@ -35,6 +35,14 @@ def suggest_name(word: object, known: Iterable[str]) -> str:
     if near is not None:
         return f"; did you mean {near!r}?"
     return f"; known: {', '.join(known)}" if known else ""
+
+
+def require_one_of(name: str, value: str, known: Collection[str]) -> None:
+    """Raises InputError for a word that is not one of the known ones; with the nearest one."""
+    if value not in known:
+        near = near_name(value, known)
+        hint = "" if near is None else f"; did you mean {near!r}?"
+        raise InputError(f"{name}: expected one of {', '.join(known)}, got {value!r}{hint}")
 
 
 def describe_value(value: object) -> str:

@@ -123,22 +123,6 @@ _VIEWS_OF_A_POSE = 3  # spots that fit some pose whatever they are
 _WHOLE_FRAME = 0.1  # of a frame interval: a delay this near to a whole number of frames suggests a wrong frame number
 
 
-def why_not_tested(result: ModelCheckResult) -> str:
-    """Why a recording was not tested; empty where it was."""
-    match result.not_tested:
-        case NotTested.NO_FRAMES:
-            return "there is no frame"
-        case NotTested.FEW_FRAMES:
-            return (
-                f"{result.frames_used} frames have {FEWEST_SPOTS} and more spots measured; the test needs"
-                f" {FEWEST_FRAMES}"
-            )
-        case NotTested.NO_REDUNDANCY:
-            return "no frame has more spots measured than its pose needs"
-        case None:
-            return ""
-
-
 def findings_of(result: ModelCheckResult, model: SpotModel) -> tuple[Finding, ...]:
     """All findings, the most severe first."""
     findings = []
@@ -353,7 +337,16 @@ class ModelCheck:
     @property
     def why_not(self) -> str:
         """Why the run was not tested; empty where it was."""
-        return why_not_tested(self.result)
+        match self.result.not_tested:
+            case NotTested.NO_FRAMES:
+                return "there is no frame"
+            case NotTested.FEW_FRAMES:
+                used = f"{self.result.frames_used} frames have {FEWEST_SPOTS} and more spots measured"
+                return f"{used}; the test needs {FEWEST_FRAMES}"
+            case NotTested.NO_REDUNDANCY:
+                return "no frame has more spots measured than its pose needs"
+            case None:
+                return ""
 
     def as_mapping(self) -> dict[str, Any]:
         """Plain values for summary.json.

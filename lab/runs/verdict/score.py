@@ -52,14 +52,10 @@ def motion_scores(poses: PoseTrack, truth: Pose) -> dict[str, Any] | None:
         "rows_at_bends_left_out": int((bent & known).sum()),
     }
     for name, part in (("velocity_m_s", slice(0, 3)), ("rate_rad_s", slice(3, 6))):
-        distance = np.linalg.norm(error[:, part], axis=1)
         squares = share[:, part][np.isfinite(share[:, part])]
         out[name] = {
-            "rms_axes": dict(zip("xyz", np.sqrt(np.mean(error[:, part] ** 2, axis=0)).tolist(), strict=True)),
-            "rms": float(np.sqrt(np.mean(distance**2))),
-            "median": float(np.median(distance)),
-            "p99": float(np.percentile(distance, 99)),
-            "max": float(distance.max()),
+            "rms_axes": dict(zip("xyz", _rms(error[:, part]), strict=True)),
+            **_norms(np.linalg.norm(error[:, part], axis=1)),
             # Mean over axes and rows; 1 if the sigmas are correct.
             "square_over_claimed_mean": float(squares.mean()) if len(squares) else None,
         }

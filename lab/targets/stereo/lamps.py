@@ -15,6 +15,7 @@ from lab.errors import InputError
 from lab.files.project.project import load_lens
 from lab.files.rig.camera_file import CameraFile, require_valid_calibration
 from lab.files.text import columns
+from lab.files.text.error_text import require_one_of
 from lab.findings.finding import Finding, Level, finding, level_above, passed
 from lab.number_format import format_length, format_number
 from lab.pictures.picture_file import MissingPicture
@@ -78,8 +79,7 @@ class LampsOptions(TrackOptions):
         Raises InputError: the file cannot be used, or there is no such detector; CalibrationError: its calibration
         failed, or is out of date.
         """
-        if self.detector not in DETECTORS:
-            raise InputError(f"--detector: expected one of {', '.join(DETECTORS)}, got {self.detector!r}")
+        require_one_of("--detector", self.detector, DETECTORS)
         lens = load_lens(self.camera, self.camera_name)
         require_valid_calibration(lens.calibration, self.camera)
         return lens

@@ -10,8 +10,9 @@ import pytest
 
 from bench.rig_calibration import as_measured, bench_figures, calibrated, measured_with, parameter_errors
 from calibration.least_squares.adjustment import AdjustmentError
-from calibration.rig.joint import CORNERS, DOTS, FRAMES, LENSES, RECORDS, SPOTS, calibrate_jointly
+from calibration.rig.joint import CORNERS, DOTS, RECORDS, SPOTS, calibrate_jointly
 from calibration.rig.rig_figures import calibrate_in_steps, central_pose, expected_pose, hold_out, spot_sigma
+from calibration.screens.network import FRAMES, LENSES
 from calibration.screens.screens import calibrate
 from calibration.terms.corners import CornerTerm
 from geometry.pose import Pose
@@ -107,10 +108,8 @@ def test_a_stand_ten_times_less_accurate_than_stated_is_detected():
 def test_a_lens_refocused_since_its_calibration_is_detected():
     c = campaign()
     left = c.lenses["left"]
-    matrix = left.camera.matrix + np.diag([9.0, 9.0, 0.0])  # 20 sigmas and more
-    found = calibrated(
-        replace(c, lenses={**c.lenses, "left": replace(left, camera=replace(left.camera, matrix=matrix))})
-    )
+    matrix = left.camera_matrix + np.diag([9.0, 9.0, 0.0])  # 20 sigmas and more
+    found = calibrated(replace(c, lenses={**c.lenses, "left": replace(left, camera_matrix=matrix)}))
     (finding,) = [f for f in findings_of(found) if f.what.startswith(LENSES)]
     assert finding.level >= Level.WARN
     assert "refocused" in finding.why

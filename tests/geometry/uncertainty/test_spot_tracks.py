@@ -15,7 +15,6 @@ from geometry.uncertainty.rig_uncertainty import (
     scatter,
     uncertainty_tracks,
     unlimited,
-    world_from_body_moved,
 )
 from tests.lab.fake_results import fake_rig
 
@@ -27,7 +26,7 @@ POSE = Pose.from_ypr(np.radians([4.0, -3.0, 2.0]), np.array([0.1, -0.05, 0.08]))
 def test_a_pose_that_is_uncertain_along_one_line_has_exactly_the_images_of_that_line():
     along = np.array([0.1, 0.2, -0.1, 0.05, -0.12, 0.1])  # large enough for tracks that bend
     tracks = uncertainty_tracks(MODEL, POSE, np.outer(along, along), 3.0, 41)
-    exact = MODEL.project(world_from_body_moved(POSE, np.linspace(-3, 3, 41)[:, None] * along))[0]
+    exact = MODEL.project(POSE.plus(np.linspace(-3, 3, 41)[:, None] * along))[0]
     for i in range(len(MODEL)):
         forward = np.nanmax(np.abs(tracks[i] - exact[:, i]))
         backward = np.nanmax(np.abs(tracks[i] - exact[::-1, i]))  # an axis has no sign

@@ -237,7 +237,7 @@ def test_mixed_sizes_are_refused(tmp_path):
     ("option", "words"),
     [
         ({"lens": "fishey"}, "lens: expected .*did you mean 'fisheye'"),
-        ({"warp": "yes"}, "warp: expected auto, on, off, got 'yes'"),
+        ({"warp": "yes"}, "warp: expected one of auto, on, off, got 'yes'"),
         ({"distance_m": float("nan")}, "distance: expected metres above 0, got nan"),
         ({"valid_days": 0}, "valid days: expected 1 or more, got 0"),
     ],

@@ -85,10 +85,10 @@ def test_lens_errors_agree_with_their_covariance():
             true = c.truth.cameras[name]
             e = np.array(
                 [
-                    lens.camera.matrix[i] - true.matrix[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2))
-                ] + list(np.array(lens.camera.distortion) - true.distortion)
+                    lens.camera_matrix[i] - true.matrix[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2))
+                ] + list(np.array(lens.distortion) - true.distortion)
             )  # fmt: skip
-            sizes.append(e @ np.linalg.solve(lens.covariance, e) / len(e))
+            sizes.append(e @ np.linalg.solve(lens.covariance.matrix, e) / len(e))
     # 24 lenses of 9 parameters: relative sigma sqrt(2 / 216) = 0.1.
     assert np.mean(sizes) == pytest.approx(1.0, abs=0.3)
 

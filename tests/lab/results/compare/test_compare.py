@@ -210,7 +210,7 @@ def test_stated_sigmas_of_angles_become_the_covariance_of_the_body(folder):
         "t_s,yaw_deg,pitch_deg,roll_deg,sigma_yaw_deg,sigma_pitch_deg,sigma_roll_deg",
         np.array([[0, 10, 50, 20, 0.1, 0.2, 0.3], [1, 12, 50, 20, 0.1, 0.2, 0.3]], dtype=float),
     )
-    motion = read_reference(path).motion
+    motion, _ = read_reference(path)
     J = rotations.ypr_jacobian(motion.rotation[0])
     sigmas = np.rad2deg(np.sqrt(np.diag(J @ motion.covariance[0, 3:, 3:] @ J.T)))
     np.testing.assert_allclose(sigmas, [0.1, 0.2, 0.3], rtol=1e-9)
