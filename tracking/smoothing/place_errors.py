@@ -57,9 +57,9 @@ def place_errors(
 
     residual (T, n, 2): labelled pixels less those of the smoothed poses, in sigmas; nan without a label. uv_px
     (T, n, 2): the pixels. width_px (n,): 1-sigma width of the spots, nan where not known. averaged (T,): number of
-    frames that each pose is a mean of. taken (n,): variance, in sigmas squared, of what the residuals may have lost or
-    kept, the same in all frames, when the errors of the rig were taken from them (`RigErrors`). predicted: the share
-    according to the texture of the background and the misfit of the fits; 0: nothing is known.
+    frames that each pose is a mean of. taken (T, n) or (n,): variance, in sigmas squared, of what the residuals may
+    have lost or kept, the same in all frames, when the errors of the rig were taken from them (`RigErrors`). predicted:
+    the share according to the texture of the background and the misfit of the fits; 0: nothing is known.
 
     The share is its mean under the posterior distribution. Few places, or few spots, whose poses absorb such errors,
     hardly show it: then the prediction decides. Many places show it whatever was predicted. The mean of a variance is
@@ -70,7 +70,7 @@ def place_errors(
     count = float(np.mean(labelled.sum(axis=1)[labelled.any(axis=1)])) if labelled.any() else 0.0
     absorbed = min(3.0 / max(count, 1e-9), _MAX_ABSORBED)
     # Coarse texture and edges of the screen reach farther than a spot is wide: take the most significant length.
-    sums = _products(residual, uv_px, [r * width for r in _REACHES], taken)
+    sums = _products(residual, uv_px, [r * width for r in _REACHES], np.broadcast_to(taken, labelled.shape))
     best = max(sums, key=lambda p: p.significance)
     if best.significance * np.sqrt(1 - absorbed) < _SIGNIFICANT:
         best = sums[0]
@@ -227,7 +227,7 @@ def _products(residual: Array, uv_px: Array, reaches_px: Sequence[Array], taken:
     sums = [_Sums(np.ones(residual.shape[:2])) for _ in reaches_px]
     for view in range(residual.shape[1]):
         rows = np.flatnonzero(np.isfinite(residual[:, view]).all(axis=-1))
-        lost = 2 * float(taken[view])
+        lost = 2 * float(np.mean(taken[rows, view])) if len(rows) else 0.0
         mean_square = lost + float(np.mean(np.sum(residual[rows, view] ** 2, axis=-1))) if len(rows) > 1 else 0.0
         if mean_square <= 0:
             continue

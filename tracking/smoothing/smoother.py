@@ -582,15 +582,12 @@ class _Smoother:
         use = (assigned >= 0) & (assigned < BLENDED) & np.isfinite(expected).all(axis=-1)
         k, view = np.nonzero(use)
         rows = detections.begin[frames[k]] + assigned[use]
-        stated, left, taken = detections.cov[rows], detections.uv[rows] - expected[use], np.zeros(len(self.model))
+        stated, left, taken = detections.cov[rows], detections.uv[rows] - expected[use], np.zeros(self.assigned.shape)
         size2 = 0.5 * np.trace(stated, axis1=1, axis2=2)
-        if self.rig_errors is not None:
-            shift, unknown = self.rig_errors.in_residuals(
-                self.views, detections, self.assigned, frames, ref, self.calibration_cov
-            )
+        if (rig := self.rig_errors) is not None:
+            shift, unknown = rig.in_residuals(self.views, detections, self.assigned, frames, ref, self.calibration_cov)
             left = left - shift[use]
-            of_points = 0.5 * np.trace(unknown[use], axis1=1, axis2=2) / size2
-            taken = np.bincount(view, of_points, len(taken)) / np.maximum(np.bincount(view, minlength=len(taken)), 1)
+            taken[frames[k], view] = 0.5 * np.trace(unknown[use], axis1=1, axis2=2) / size2
         residual[frames[k], view] = left / np.sqrt(size2)[:, None]
         uv_px[frames[k], view] = detections.uv[rows]
         shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size2

@@ -61,9 +61,7 @@ def test_differences_at_the_true_alignment_agree_with_the_stated_covariances():
 
 
 @pytest.mark.parametrize(("alike", "frames"), [(0.0, 120), (4.0, 120), (8.0, 240)])
-def test_poses_with_errors_that_are_alike_for_many_frames_agree_with_their_covariances_after_an_alignment(
-    alike, frames
-):
+def test_poses_with_errors_that_are_alike_for_many_frames_agree_with_their_covariances(alike, frames):
     """Each parameter takes as many degrees of freedom as frames are alike: without them chi-square is .5 or less."""
     factors, sigmas = [], []
     for seed in range(24):
