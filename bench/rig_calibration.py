@@ -1,19 +1,27 @@
 """Accuracy of calibrated rigs and of their stated uncertainty, from simulated campaigns.
 
     python -m bench.rig_calibration [campaigns] [first seed]
+    python -m bench.rig_calibration [campaigns] [first seed] --recordings [px of noise]
 
 Each campaign is drawn (mounting, lens calibrations, survey, stand, spots) and calibrated by the joint adjustment. A new
 recording of the true rig is processed with the result: one frame at each of some poses. Printed: errors of attitude and
 position, their NEES (normalised estimation error squared, 1 per component if the covariance is correct), and the share
 of parameters within one sigma.
+
+With --recordings a slow recording of the true rig is processed twice: with the calibrated rig, and with the true one.
+Both see the same points, so that the noise part of their sigmas should be the same. Printed: the ratio, the share of
+errors of places, NEES/6 with the errors of the calibration, which the frames of a recording share, and chi-square per
+degree of freedom as `beampose compare` computes it.
 """
 
 from __future__ import annotations
 
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -29,9 +37,15 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty, independent
+from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
+from lab.files.run.results import ResultFolder, read_summary
+from lab.results.compare import compare
+from lab.runs.process import process_run
 from lab.simulate.campaign import Campaign, CampaignQuality, draw_campaign, spots_at
+from lab.simulate.write import simulate
 
 POSES_PER_CAMPAIGN = 5  # of the new recording; they share the errors of the calibration
+FRAMES = 120  # of a recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,10 +216,56 @@ def figures(trials: Sequence[Trial]) -> dict[str, float]:
     }
 
 
+def written(rig: Rig, covariance: RigCovariance | None, path: Path) -> Path:
+    """A rig.yaml."""
+    save_rig(RigFile(rig, {} if covariance is None else covariance_blocks(covariance)), path)
+    return path
+
+
+def noise_part(results: Path) -> Array:
+    """Covariances (T, 6, 6) of the poses without the errors of the calibration."""
+    poses = ResultFolder.of_run(results).poses
+    return np.asarray(poses.covariance - np.nan_to_num(poses.systematic))
+
+
+def recorded(seed: int, noise_px: float, work: Path) -> str:
+    """The figures of one campaign and its recording, as a line."""
+    c = draw_campaign(seed, "fan")
+    joint = calibrated(c).joint
+    true, known = written(c.truth, None, work / "true.yaml"), written(joint.rig, joint.covariance, work / "known.yaml")
+    folders = [
+        simulate(
+            "small-motion", work / name, seed=seed, frames=FRAMES, detections_only=True, noise_px=noise_px, rig=true,
+            known_rig=given,
+        )
+        for name, given in (("exact", true), ("calibrated", known))
+    ]  # fmt: skip
+    exact, found = (work / f"{f.name}-results" for f in folders)
+    for run, results in zip(folders, (exact, found), strict=True):
+        process_run(run, results)
+    ratio = np.trace(np.linalg.solve(noise_part(exact), noise_part(found)), axis1=1, axis2=2) / 6
+    summary = read_summary(found)
+    nees = summary["errors"]["pose"]["measured"]["nees_mean"] / 6
+    chi2 = compare(found, reference=folders[1] / "truth" / "pose.csv").noise
+    return (
+        f"seed {seed}: sigma over that with the exact rig {np.sqrt(np.median(ratio)):.2f}, places"
+        f" {summary['smoother']['place_share']:.3f}, NEES/6 {nees:.2f},"
+        f" chi-square {chi2.factor:.2f} +- {chi2.sigma:.2f}, {summary['verdict']['status']}"
+    )
+
+
 def main(arguments: Sequence[str]) -> None:
     """Print the figures."""
+    recordings = "--recordings" in arguments
+    at = arguments.index("--recordings") if recordings else len(arguments)
+    arguments, noise = arguments[:at], arguments[at + 1 :]
     count = int(arguments[0]) if arguments else 10
     first = int(arguments[1]) if len(arguments) > 1 else 0
+    if recordings:
+        for seed in range(first, first + count):
+            with tempfile.TemporaryDirectory() as work:
+                print(recorded(seed, float(noise[0]) if noise else 0.01, Path(work)), flush=True)
+        return
     trials = []
     for seed in range(first, first + count):
         trials.append(trial(seed))
