@@ -583,14 +583,14 @@ class _Smoother:
         k, view = np.nonzero(use)
         rows = detections.begin[frames[k]] + assigned[use]
         stated, left, taken = detections.cov[rows], detections.uv[rows] - expected[use], np.zeros(self.assigned.shape)
-        size2 = 0.5 * np.trace(stated, axis1=1, axis2=2)
+        size = np.sqrt(0.5 * np.trace(stated, axis1=1, axis2=2))
         if (rig := self.rig_errors) is not None:
             shift, unknown = rig.in_residuals(self.views, detections, self.assigned, frames, ref, self.calibration_cov)
             left = left - shift[use]
-            taken[frames[k], view] = 0.5 * np.trace(unknown[use], axis1=1, axis2=2) / size2
-        residual[frames[k], view] = left / np.sqrt(size2)[:, None]
+            taken[frames[k], view] = 0.5 * np.trace(unknown[use], axis1=1, axis2=2) / size**2
+        residual[frames[k], view] = left / size[:, None]
         uv_px[frames[k], view] = detections.uv[rows]
-        shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size2
+        shares = self.errors.place_px2(detections, self.rec.place_px2())[rows] / size**2
         width_px, share = self.detections.usual_size_px, float(np.mean(shares)) if len(shares) else 0.0
         found = place_errors(residual, uv_px, width_px, averaged, taken, share)
         own = scaled_shares(shares, share, found.share) * found.more[frames[k], view] * averaged[frames[k]]
