@@ -49,13 +49,10 @@ class RigErrors:
             same = frames_with_same_error(points.uv[:, i], PLACE_REACH * width)
             points.cov[:, i] *= (1 + share[:, i] * (same - 1))[:, None, None]
         residual = (points.uv - project_all(views, points.R, points.t)[0])[..., None]
-        moves = points.moves(calibration)
+        both = np.concatenate([residual, points.moves(calibration)], axis=-1)
         for _ in range(2):  # the second time without outliers
-            left, A, W = (
-                points.beside_poses(views, residual)[..., 0],
-                points.beside_poses(views, moves),
-                points.weights(),
-            )
+            beside, W = points.beside_poses(views, both), points.weights()
+            left, A = beside[..., 0], beside[..., 1:]
             WA = W @ A
             covariance = np.linalg.inv(np.eye(A.shape[-1]) + np.einsum("knip,kniq->pq", A, WA, optimize=True))
             mean = covariance @ np.einsum("knip,kni->p", WA, left)
