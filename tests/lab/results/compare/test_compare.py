@@ -106,6 +106,18 @@ def test_differences_far_below_the_stated_uncertainties_do_not_agree_with_them(f
     assert outcome.lines[0].startswith("PASS: the differences are smaller than the stated uncertainties: chi-square")
 
 
+@pytest.mark.parametrize(
+    ("frames", "alike", "words"),
+    [(200, 4.0, "the differences agree with"), (80, 30.0, "the frames have too few independent errors to test")],
+)
+def test_smoothed_poses_agree_with_their_uncertainties_or_are_too_few_to_test_them(folder, frames, alike, words):
+    """With 14 parameters of an alignment counted as 14, both would be smaller than the stated uncertainties."""
+    result, reference = recordings(3, truth=SIMPLE, frames=frames, reference_sigmas=(1e-7, 1e-7), alike=alike)
+    one = write_results(folder / "results" / f"alike-{frames}", result)
+    path = write_tum(folder / f"alike-{frames}.tum", reference)
+    assert compare_and_write(one, None, path, folder / f"alike-{frames}").lines[0].startswith(f"PASS: {words}")
+
+
 def test_frames_that_are_excluded_have_a_colour_of_the_page_and_are_explained(folder, result, motions):
     """A shape of a class without a rule is black in every browser."""
     jumps = motions[1].position_m.copy()
