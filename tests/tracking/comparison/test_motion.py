@@ -60,13 +60,16 @@ def test_differences_at_the_true_alignment_agree_with_the_stated_covariances():
     assert 0.93 < c.within <= 1.0
 
 
-@pytest.mark.parametrize(("alike", "frames"), [(0.0, 120), (4.0, 120), (8.0, 240)])
+@pytest.mark.parametrize(
+    ("alike", "frames"),
+    [pytest.param(0.0, 120, marks=pytest.mark.slow), (4.0, 120), pytest.param(8.0, 240, marks=pytest.mark.slow)],
+)
 def test_poses_with_errors_that_are_alike_for_many_frames_agree_with_their_covariances(alike, frames):
     """Each parameter takes as many degrees of freedom as frames are alike: without them chi-square is .5 or less."""
     factors, sigmas = [], []
     for seed in range(24):
         result, reference = recordings(seed, frames=frames, reference_sigmas=(1e-6, 1e-6), alike=alike)
-        e = estimate_alignment(result, reference)
+        e = estimate_alignment(result, reference, offset_s=TRUTH.offset_s)
         found = differences(result, reference, e.alignment)
         c = chi_square(found.chi2, found.freedom, found.known & e.inliers, e.freedom)
         factors.append(c.factor)
