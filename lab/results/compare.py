@@ -454,7 +454,7 @@ def compare(
             " offset of its clock with --offset, or allow it to be estimated (--align time)"
         )
     used = found.known if estimate is None else estimate.inliers & found.known
-    freedom = Freedom(0.0, 1.0) if estimate is None else estimate.freedom
+    freedom = Freedom() if estimate is None else estimate.freedom
     stated_total = None
     if np.any(total.covariance != mine.covariance):
         with_total = differences(total, theirs, alignment, gap)

@@ -19,13 +19,12 @@ from lab.files.text.dataclass_fields import with_overrides
 from lab.files.text.error_text import require_one_of
 from lab.findings.finding import Finding, Level, finding
 from lab.number_format import format_number, format_percent, format_some
-from lab.pictures.picture_file import MissingPicture
-from lab.pictures.source import PictureSource, open_inputs, pictures_of_frames
+from lab.pictures.source import PictureSource, open_inputs
 from lab.progress import Progress
 from lab.report.page import Section
 from lab.report.plot.series import Line
 from lab.report.plot.svg import VERMILLION, histogram
-from lab.runs.frames.sensor_noise import CameraNoise, noise_frames
+from lab.runs.frames.sensor_noise import CameraNoise, noise_pictures
 from lab.targets.page import TimeAxis
 from lab.targets.recording import every_frame, read_pictures, read_points
 from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate
@@ -193,8 +192,7 @@ class PointTarget(Target[PointFrame]):
         if self.detector != "spots":
             return partial(find_blobs, parameters=self.settings.blobs)
         noise = CameraNoise(inputs.camera)
-        first = pictures_of_frames(inputs, noise_frames(inputs)).values()
-        noise.estimate_from([p for p in first if not isinstance(p, MissingPicture)])
+        noise.estimate_from(noise_pictures(inputs))
         return partial(noise.detect, parameters=self.settings.detect)
 
     def row(self, track: Track[PointFrame], k: int) -> list[object]:

@@ -238,8 +238,8 @@ class Free:
 class Freedom(NamedTuple):
     """How many of the residuals of an alignment are independent of each other."""
 
-    taken: float  # degrees of freedom that the parameters take from them
-    alike: float  # sum of the squared correlations of an error with all errors of its coordinate; 1: independent
+    taken: float = 0.0  # degrees of freedom that the parameters take from them
+    alike: float = 1.0  # sum of the squared correlations of an error with all errors of its coordinate; 1: independent
 
     @staticmethod
     def of(residual: Array, derivatives: Array) -> Freedom:
@@ -253,7 +253,7 @@ class Freedom(NamedTuple):
         """
         (n, m), k = residual.shape, derivatives.shape[2]
         if not k or not residual.any():
-            return Freedom(float(k), 1.0)
+            return Freedom(float(k))
         columns = np.linalg.qr(derivatives.reshape(n * m, k))[0].reshape(n, m * k)
         seen, of_columns = _products(residual), _products(columns)
         twice = np.r_[1.0, np.full(len(seen) - 1, 2.0)]  # a lag is one of two, forward and backward

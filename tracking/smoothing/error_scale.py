@@ -46,8 +46,9 @@ class ErrorScale:
     ) -> ErrorScale:  # fmt: skip
         """The corrections from the labelled spots of T frames, with their single-frame poses near a reference motion.
 
-        place_px2 (m,): variances of the detections that belong to their places; calibration_cov (n, 2, 2). motion_cov
-        (m, 2, 2): of where the detections are at the instants of their frames, beyond their own.
+        place_px2 (m,): variances of the detections that belong to their places; calibration_cov (n, 2, 2): as in
+        `variance_factors`. motion_cov (m, 2, 2): of where the detections are at the instants of their frames, beyond
+        their own.
         """
         views, camera = model.numbers, model.camera_of
         misfit = usual_misfit(run, place_px2, assigned, camera)

@@ -29,13 +29,13 @@ from lab.findings.finding import Done
 from lab.number_format import format_count, format_some
 from lab.packages import versions
 from lab.pictures.picture_file import GreyPicture, MissingPicture
-from lab.pictures.source import PictureSource, Video, open_inputs, pictures, pictures_of_frames
+from lab.pictures.source import PictureSource, Video, open_inputs, pictures
 from lab.progress import Progress
 from lab.report.page import as_script, environment
 from lab.report.plot.svg import grey_limits, image_uri
 from lab.runs.detect.detect_page import ContactSheet, write_detect_page
 from lab.runs.detect.picture_series import PictureSeries
-from lab.runs.frames.sensor_noise import noise_frames
+from lab.runs.frames.sensor_noise import noise_pictures
 from lab.runs.processed import quantiles
 from lab.runs.tables import detection_rows
 from tracking.detection.detect import limit_that_admits
@@ -79,8 +79,7 @@ def detect_pictures(
     source = str(inputs.path if isinstance(inputs, Video) else given[0] if len(given) == 1 else f"{len(given)} files")
     series = PictureSeries(inputs.camera, source, parameters, notes=list(inputs.notes))
     with atomic_folder(out, earlier_results(SCHEMA)) as folder:
-        first = pictures_of_frames(inputs, noise_frames(inputs)).values()
-        series.estimate_noise([p for p in first if not isinstance(p, MissingPicture)])
+        series.estimate_noise(noise_pictures(inputs))
         sheet = ContactSheet(_total(inputs, options))
         _search_all(inputs, series, sheet, folder / "detections.csv", options, progress)
         _add_notes(series)

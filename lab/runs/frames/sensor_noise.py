@@ -15,6 +15,7 @@ from geometry.arrays import evenly_spread
 from geometry.camera import Camera, SensorNoise
 from lab.files.run.run_file import Run
 from lab.pictures import source as picture_source
+from lab.pictures.picture_file import GreyPicture, MissingPicture
 from lab.pictures.source import PictureFiles, PictureSource, pictures_of_frames
 from lab.runs.frames.frames import FrameReader
 from tracking.background.camera_motion import FARTHEST_PX, CameraMotion, shift_between
@@ -334,6 +335,12 @@ def noise_frames(source: PictureSource) -> list[int]:
     if isinstance(source, PictureFiles):
         return [int(source.numbers[i]) for i in noise_estimation_frames(source.count)]
     return list(VIDEO_PICTURES)
+
+
+def noise_pictures(source: PictureSource) -> list[GreyPicture]:
+    """The pictures from which the noise is estimated, as far as they can be read."""
+    found = pictures_of_frames(source, noise_frames(source)).values()
+    return [p for p in found if not isinstance(p, MissingPicture)]
 
 
 def successive_frames(source: PictureSource) -> list[int]:

@@ -18,13 +18,12 @@ from lab.files.text import columns
 from lab.files.text.error_text import require_one_of
 from lab.findings.finding import Finding, Level, finding, level_above, passed
 from lab.number_format import format_length, format_number
-from lab.pictures.picture_file import MissingPicture
-from lab.pictures.source import open_inputs, pictures_of_frames
+from lab.pictures.source import open_inputs
 from lab.progress import Progress
 from lab.report.page import Section
 from lab.report.plot.series import Band, Line
 from lab.report.plot.svg import BLUE, SKY
-from lab.runs.frames.sensor_noise import noise_frames
+from lab.runs.frames.sensor_noise import noise_pictures
 from lab.runs.processed import quantiles
 from lab.runs.tables import pose_numbers
 from lab.targets.page import TimeAxis
@@ -107,8 +106,7 @@ class LampsTarget(Target[LampFrame]):
     def read(self, path: Path, progress: Progress | None) -> Track[LampFrame]:
         inputs = open_inputs([path])
         rate = self.options.rate_hz or header_rate(inputs) or DEFAULT_RATE_HZ
-        first = pictures_of_frames(inputs, noise_frames(inputs)).values()
-        seen = [p for p in first if not isinstance(p, MissingPicture)]
+        seen = noise_pictures(inputs)
         # Without it the texture of ground counts as lights, and each costs a fit.
         noise = estimate_noise(seen).model if seen else None
         detector = DETECTORS[self.options.detector]

@@ -53,7 +53,7 @@ def test_a_motion_needs_content_and_rising_times():
 def test_differences_at_the_true_alignment_agree_with_the_stated_covariances():
     result, reference = recordings(4, frames=600)
     found = differences(result, reference, TRUTH)
-    c = chi_square(found.chi2, found.freedom, found.known, Freedom(0.0, 1.0))
+    c = chi_square(found.chi2, found.freedom, found.known, Freedom())
     assert found.freedom == 6
     # Interpolation averages the reference's noise, which is a fifth of the variance: slightly below 1.
     assert 0.8 < c.factor < 1.05
