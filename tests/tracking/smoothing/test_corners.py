@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -95,6 +96,50 @@ def test_a_corner_within_an_exposure_does_not_shift_the_pose_beyond_its_sigma(sh
     assert 0.75 < np.mean(np.concatenate(others)) / 6 < 1.25
     assert max(np.max(n) for n in (*inside, *others)) < 60
     assert len(np.concatenate(inside)) >= 3
+
+
+def errors_of_a_swing(seed: int, share: float, hz: float, rad: float) -> tuple[Array, Array]:
+    """Pose errors (T, 6) and NEES / 6 (T,) of a vehicle whose components swing at about hz and 100 frames per second.
+
+    rad: 1 sigma of the amplitudes of the angles. Spots are the means of their paths over a share of the frame.
+    """
+    rng = np.random.default_rng([seed, 9])
+    t_s, rate_hz = np.arange(90) / 100.0, 100.0
+    turn, phase = 2 * np.pi * hz * rng.uniform(0.8, 1.2, 6), rng.uniform(0, 2 * np.pi, 6)
+    size = rad * np.repeat([1 / 3, 1.0], 3) * rng.normal(size=6)
+
+    def at(moment: Array) -> Pose:
+        return START.plus(size * np.sin(turn * moment[:, None] + phase))
+
+    run = recording_of(RIGS["four-skew-beams"](), at(t_s), t_s, NOISE_PX, seed, prior=PRIOR)
+    streak = -run.model.project(at(t_s))[0]
+    for node, weight in zip(*np.polynomial.legendre.leggauss(6), strict=True):
+        streak += 0.5 * weight * run.model.project(at(t_s + 0.5 * share / rate_hz * node))[0]
+    measured = tuple(
+        tuple(replace(d, uv_px=d.uv_px + of_frame[spots]) for d, spots in zip(detections, origin, strict=True))
+        for detections, origin, of_frame in zip(run.detections, run.origin, streak, strict=True)
+    )
+    run = replace(run, detections=measured)
+    recording = TrackedRecording(run.rig, RIGID, exposure_s=share / rate_hz)
+    for k, frame in enumerate(tracked(run)):
+        recording.append(dt_of(run, k), found_in(run, k), frame)
+    result = smooth(recording)
+    error = result.poses.minus(at(t_s))
+    return error, np.einsum("ki,kij,kj->k", error, np.linalg.inv(result.covariance), error) / 6
+
+
+@pytest.mark.parametrize(("hz", "rad", "seed"), [(6.0, 0.1, 1), (6.0, 0.1, 2), (9.0, 0.03, 1), (6.0, 0.03, 1)])
+def test_a_fast_swing_is_no_series_of_corners(hz, rad, seed):
+    """Of a corner within an exposure nothing shows where it is; a swing in long exposures is as exact as in short ones.
+
+    The angles turn back every eight frames or so, and the spots move by up to 50 px from frame to frame.
+    """
+    instant, _ = errors_of_a_swing(seed, 0.0, hz, rad)
+    long, nees = errors_of_a_swing(seed, 0.4, hz, rad)
+    rms = [np.sqrt(np.mean(e[:, 3:] ** 2)) for e in (instant, long)]
+    assert rms[1] < 1.25 * rms[0]
+    assert 0.4 < np.mean(nees) < 1.5
+    assert np.max(nees) < 7
 
 
 def test_strong_accelerations_within_a_long_exposure_are_in_the_covariances():

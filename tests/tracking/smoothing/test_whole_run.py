@@ -79,7 +79,10 @@ def test_a_vehicle_that_rests_at_the_end_of_the_spots_may_go_on_as_it_moved_befo
 
 
 def passes_over_a_corner(rate_rad_s: float, monkeypatch: pytest.MonkeyPatch) -> int:
-    """Number of passes of the estimate of a vehicle whose pitch rate jumps by twice a rate within an exposure."""
+    """Most passes of an estimate of a vehicle whose pitch rate jumps by twice a rate within an exposure.
+
+    With the jump, and without it: they are compared.
+    """
     t_s, corner_s, exposure_s = np.arange(FRAMES) / 100, 0.25, 5e-4
     angle = -rate_rad_s * np.abs(t_s - corner_s)
     poses = AT_REST.plus(np.stack([0 * t_s] * 4 + [angle, 0 * t_s], axis=-1))
@@ -92,10 +95,11 @@ def passes_over_a_corner(rate_rad_s: float, monkeypatch: pytest.MonkeyPatch) -> 
     every = np.ones(FRAMES, dtype=bool)
     straight = np.concatenate([poses.rotation, poses.translation[:, None]], axis=1)
     passes = []
-    monkeypatch.setattr(_Estimator, "_step", lambda *a, step=_Estimator._step: passes.append(1) or step(*a))
+    monkeypatch.setattr(_Estimator, "_step", lambda *a, step=_Estimator._step: passes.append(a[0]) or step(*a))
     motion = SmoothedMotion.begin(straight_between(straight, every, t_s), recording.jumped.copy(), None)
     estimate(whole, assigned, every, motion, 0, every)
-    return len(passes)
+    assert len(set(passes)) >= 2
+    return max(map(passes.count, passes))
 
 
 @pytest.mark.parametrize("rate_rad_s", np.geomspace(0.3, 3.0, 12))

@@ -48,6 +48,7 @@ ROUNDING_NATS = 10.0  # by which rounding may raise the cost
 GLOBAL_PASSES = 5  # with one strength of the jerk for the whole run; then each window has its own
 FIRST_ADAPTING_PASSES, LATER_ADAPTING_PASSES = 14, 2  # after which the strength is kept: in the first and later rounds
 NO_JUMPS_BEFORE = 2  # passes: before that the strength of the jerk is too uncertain to detect jumps
+NATS_PER_JUMP = 3.0  # by which a motion without jumps must be likelier: in doubt jumps, whose covariances are wider
 CONVERGED_SIGMAS = 0.02  # a Gauss-Newton step below this is negligible
 CONVERGED_LOG_DENSITY = 0.3  # change of log q, weighted by its determined components, below which the strength is kept
 DAMPING = (np.inf, 0.1, 0.01, 1e-3)  # m and rad: tried in turn until the cost falls; inf: none
@@ -73,15 +74,31 @@ def estimate(
         return replace(motion, known=np.zeros(len(run.dt), dtype=bool), weight=np.zeros(len(run.dt)))
     at = np.flatnonzero(used)
     core = slice(int(at[0]), int(at[-1]) + 1)
-    return _Estimator(run, assigned, measured, used, core, motion).run_passes()
+    estimator = _Estimator(run, assigned, measured, used, core, motion)
+    estimated = estimator.run_passes()
+    if not (estimator.fresh and estimator.jumped.any()):
+        return estimated
+    # Fast swings look like corners as long as the strength of their jerk is not known.
+    steady = replace(motion.without_covariances(), jumped=np.zeros_like(motion.jumped))
+    swinging = _Estimator(run, assigned, measured, used, core, steady, jumps=False)
+    try:
+        other = swinging.run_passes()
+    except FloatingPointError:
+        return estimated
+    if swinging.log_evidence() < estimator.log_evidence() + NATS_PER_JUMP * estimator.jumped.sum():
+        return estimated
+    return _Estimator(run, assigned, measured, used, core, other.without_covariances()).run_passes()
 
 
 class _Estimator:
     """Passes over the core of one run: the frames from the first used one to the last."""
 
     def __init__(
-        self, run: WholeRun, assigned: Ints, measured: Bools, used: Bools, core: slice, motion: SmoothedMotion
-    ) -> None:
+        self, run: WholeRun, assigned: Ints, measured: Bools, used: Bools, core: slice, motion: SmoothedMotion,
+        jumps: bool = True,
+    ) -> None:  # fmt: skip
+        """jumps: whether steps may get a velocity jump beside those of `motion`."""
+        self.jumps = jumps
         self.run, self.assigned, self.used, self.core, self.motion = run, assigned, used, core, motion
         self.weight = np.where(used, np.where(measured, 1.0, PARTIAL_WEIGHT), 0.0)
         self.measured = measured[core]
@@ -114,7 +131,7 @@ class _Estimator:
             sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
             converged = bool(np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd))
             new = np.zeros_like(self.jumped)
-            if (adapting or not self.run.adapt_jerk) and number >= NO_JUMPS_BEFORE:
+            if self.jumps and (adapting or not self.run.adapt_jerk) and number >= NO_JUMPS_BEFORE:
                 new = new_jumps(out.shock, self.jumped)
                 self.jumped |= new
             if adapting:
@@ -178,6 +195,22 @@ class _Estimator:
         edge: Bools = np.concatenate([[True], ~self.measured | self.jumped, [True]])
         near: Bools = largest_near(edge, memory)[1:-1]
         return ~near
+
+    def log_evidence(self) -> float:
+        """Log-likelihood of the spots, nats up to a constant, with the motion integrated out.
+
+        Each known velocity jump is at most as large as it is in the reference: with the variance of the fastest motion
+        nearby, a slow corner is less likely than none.
+        """
+        info, chi2 = self._information(self.ref)
+        at = np.flatnonzero(self.jumped)
+        change = (self.ref.m[at] - self.ref.m[at - 1]).reshape(-1, 4, 3)
+        size = np.mean(change**2, axis=2)
+        velocity, acceleration = info.velocity_jump.copy(), info.acceleration_jump.copy()
+        velocity[at] = np.minimum(velocity[at], size[:, :2])
+        acceleration[at] = np.minimum(acceleration[at], size[:, 2:])
+        info = info._replace(velocity_jump=velocity, acceleration_jump=acceleration)
+        return log_likelihood(self.ref, info, np.exp(self.log_density)) - 0.5 * chi2
 
     # -- Gauss-Newton -------------------------------------------------------------------------------------------------
 
