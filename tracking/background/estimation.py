@@ -66,11 +66,16 @@ def static_background(
     background, some = light.background, light.pictures
     if len(some) < _LEAST_PICTURES:
         return None
-    tried = some[::TRIED]
     few = len(background.lights.found) < _MANY_LIGHTS and not in_any_case
-    moving = few and any(len(background.spots_in(p, parameters, shift)) for p in tried)
-    if moving and sum(_better_in(background, p, shift) for p in tried) < max(_LEAST_FOUND * len(tried), 2):
-        return None
+    if few and any(len(background.spots_in(p, parameters, shift)) for p in some[::TRIED]):
+        # A few pictures decide, unless one of them shows a better spot.
+        for tried in (some[::TRIED], some):
+            better = sum(_better_in(background, p, shift) for p in tried)
+            enough = better >= max(_LEAST_FOUND * len(tried), 2)
+            if enough or not better:
+                break
+        if not enough:
+            return None
     return _without_slow_lights(light, shift, others_move)
 
 

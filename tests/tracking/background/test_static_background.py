@@ -11,7 +11,7 @@ import pytest
 
 from geometry.arrays import Array
 from tests.tracking.rendering import round_lights
-from tracking.background import mean_pictures
+from tracking.background import estimation, mean_pictures
 from tracking.background.estimation import PICTURES, EqualLight, static_background
 from tracking.background.static_background import StaticBackground
 from tracking.detection.detect import find_spots
@@ -212,6 +212,21 @@ def test_spots_that_rest_for_a_part_of_the_recording_are_found_there_and_not_shi
 
 def test_bright_spots_need_no_background():
     assert Recording.of(path(45, 6, 4.0, 7), 180.0).background() is None
+
+
+@pytest.mark.parametrize(("better", "used", "asked"), [({6, 7, 11}, True, 20), ({6, 7}, False, 20), ({7}, False, 5)])
+def test_all_pictures_decide_where_few_show_one_better_spot(better, used, asked, monkeypatch):
+    """Objects that hide spots in some places, which a spot passes in one of the five pictures that decide at first."""
+    recording, calls = Recording.of(path(45, 6, 4.0, 7), 180.0), []
+
+    def better_in(background: StaticBackground, picture: Picture, shift: TextureShift) -> int:
+        calls.append(next(k for k, p in enumerate(recording.pictures[::3]) if p is picture))
+        return int(calls[-1] in better)
+
+    monkeypatch.setattr(estimation, "_better_in", better_in)
+    assert (recording.background() is not None) == used
+    assert len(calls) == asked
+    assert calls[:5] == [0, 3, 6, 9, 12]
 
 
 def test_lights_that_do_not_move_stay_as_the_picture_shows_them():
