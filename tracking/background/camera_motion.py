@@ -40,6 +40,7 @@ _SHARED = 4 * np.pi * _BLUR_PX**2  # landmarks that share their noise, at most
 FARTHEST_PX = 8  # largest movement that is corrected
 _SOME = 4  # every such landmark shows which movement of a whole picture is nearest
 _LEAST_PEAK = 0.3  # of a correlation of pictures: .3 to .5 in front of a room, .16 of eight lights that move alike
+_LEAST_STRUCTURE = 0.1  # share of the pixels: compressed videos of rooms have .27 and more, of even screens .01 to .06
 _ROUNDS = 6  # of the fit, whose weights and whose place change
 _NEAR_PX, _ON_PX = 0.03, 0.005  # a movement that is not undone but corrected; one that is no movement
 _OUTLIER = 3.0  # sigmas: what a landmark leaves counts in full up to this, and not at all beyond twice of it
@@ -261,7 +262,10 @@ def shift_between(first: Picture | NDArray[np.float32], second: Picture) -> Arra
     if first.shape != second.shape:
         return np.zeros(2)
     window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
-    shift, peak = cv2.phaseCorrelate(_curvature(first), _curvature(second), np.asarray(window, np.float32))
+    curved = _curvature(first), _curvature(second)
+    if min(map(np.count_nonzero, curved)) < _LEAST_STRUCTURE * first.size:
+        return np.zeros(2)
+    shift, peak = cv2.phaseCorrelate(*curved, np.asarray(window, np.float32))
     return np.array(shift) if peak > _LEAST_PEAK else np.zeros(2)
 
 

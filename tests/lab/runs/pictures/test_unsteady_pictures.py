@@ -24,7 +24,8 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.files.rig.rig_file import load_rig
 from lab.pictures.delivery import without_repeats
-from tracking.background.camera_motion import CameraMotion
+from tests.tracking.rendering import round_lights
+from tracking.background.camera_motion import CameraMotion, shift_between
 from tracking.noise import NoiseModel
 from tracking.parameters import DetectParameters
 
@@ -301,3 +302,15 @@ def test_lights_of_an_unlit_room_do_not_show_how_a_camera_moves():
     matrix = np.array([[700.0, 0, 320], [0, 700.0, 240], [0, 0, 1]])
     camera = Camera("left", "wall", (640, 480), matrix, (), Pose.identity())
     assert CameraMotion.of(pictures, camera, NoiseModel(1.0, 0.0, 8.0), DetectParameters()) is None
+
+
+@pytest.mark.parametrize("quality", [None, 60, 90])
+def test_lights_that_move_alike_before_an_even_screen_are_no_moved_camera(quality):
+    """Compression takes the noise away, by which other pictures of an even screen differ everywhere."""
+    pictures, places = [], np.random.default_rng(1).uniform(100, 300, (4, 2))
+    for moved in ([0.0, 0.0], [53.0, -4.0]):
+        picture = np.clip(np.rint(12 + round_lights((480, 640), places + moved, 250.0, 2.0)), 0, 255).astype(np.uint8)
+        if quality:
+            picture = cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], -1)
+        pictures.append(picture)
+    assert not shift_between(*pictures).any()
