@@ -33,8 +33,7 @@ from lab.targets.stereo.run import GOOD_NOISE_SCALE, LARGEST_NOISE_SCALE, load_l
 from lab.targets.stereo.tables import attitude_row, covariance_rows
 from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate, track_pictures
 from tracking.binocular.calibration_check import MOST_FRAMES, CalibrationCheck, LabelledFrame, check_calibration
-from tracking.binocular.lamp_corners import harris_corners
-from tracking.binocular.lamp_tracker import LampFrame, LampTracker
+from tracking.binocular.lamp_tracker import LampFrame, LampTracker, harris_corners
 from tracking.binocular.marker_model import MarkerImages, MatchParameters
 from tracking.detection.detect import find_spots
 from tracking.noise import NoiseModel, Picture

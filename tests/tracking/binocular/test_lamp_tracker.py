@@ -23,8 +23,7 @@ from studies.fu2016 import (
 from tracking.binocular.acquisition import observations
 from tracking.binocular.histories import _has_its_lights, _relative_motion
 from tracking.binocular.joint_fit import MarkerObservations
-from tracking.binocular.lamp_corners import harris_corners, harris_response
-from tracking.binocular.lamp_tracker import LampTracker
+from tracking.binocular.lamp_tracker import LampTracker, harris_corners, harris_response
 from tracking.binocular.marker_model import MarkerImages
 from tracking.statuses import Cause, PoseStatus
 
