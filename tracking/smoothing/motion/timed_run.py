@@ -406,7 +406,7 @@ class _TimedEstimator(_Estimator):
     def _hidden_excluded(self) -> bool:
         """Exclude jumps from gaps where the motion around is more likely without; whether from any more."""
         search, before, every = self._search(), self.steady.copy(), self._hidden(np.ones(len(self.t_s)))
-        for first, end in true_ranges(every.any(axis=1)):
+        for first, end in true_ranges(np.asarray(every.any(axis=1))):
             steady, allowed = search.gap_share(slice(first, end), every, self.turns)
             self.steady[first:end] |= steady
             self.allowed[first:end] = np.maximum(self.allowed[first:end], allowed)
