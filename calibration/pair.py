@@ -26,7 +26,7 @@ from calibration.least_squares.adjustment import (
 from calibration.lens.board_shape import HALF_SIGNIFICANT
 from calibration.lens.fit.lens_adjustment import coefficient_prior
 from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics import Intrinsics
 from calibration.terms.corners import CornerTerm
 from calibration.terms.surveyed import array_of, pose_of
 from geometry.arrays import Array, Bools, Ints

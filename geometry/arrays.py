@@ -37,6 +37,12 @@ def evenly_spread(rows: Ints, most: int) -> Ints:
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 
+def true_ranges(mask: Bools) -> list[tuple[int, int]]:
+    """First index and one past the last index of each run of True in (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
 def finite(values: Array, axes: int | tuple[int, ...]) -> Bools:
     """Whether all numbers along these axes are finite."""
     return np.asarray(np.isfinite(values).all(axis=axes), dtype=np.bool_)

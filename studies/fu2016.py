@@ -18,8 +18,7 @@ from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, picture_uri, robust_range
 from lab.targets.stereo.lamps import spots
 from studies.comparison import Comparison, ComparisonRow, Figure
-from tracking.binocular.lamp_corners import harris_corners
-from tracking.binocular.lamp_tracker import LampFrame, LampTracker
+from tracking.binocular.lamp_tracker import LampFrame, LampTracker, harris_corners
 from tracking.binocular.marker_model import MarkerModel
 from tracking.statuses import PoseStatus
 from tracking.unscented import (

@@ -21,8 +21,7 @@ from calibration.boards.board_types import parse
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.view_equations import ViewEquations
-from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics import Intrinsics, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from calibration.pair import PairError, calibrate_pair
 from geometry.arrays import Array, Bools, Ints
 from lab.calibrate.camera.camera import corner_table

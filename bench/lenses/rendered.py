@@ -21,8 +21,7 @@ from calibration.boards.board_types import Board, Charuco, CircleGrid, parse
 from calibration.boards.board_view import BoardView
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture, rational_of_fisheye
-from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics import Intrinsics, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from geometry.arrays import Array
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError, Values
-from calibration.lens.board_shape import MOST_POINTS, SIGNIFICANT, BoardShapeOptions, BoardTest, board_test
+from calibration.lens.board_shape import MOST_POINTS, SIGNIFICANT, BoardShapeOptions, BoardTest, WarpTest, board_test
 from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.coverage import coverage_of, spread_deg
+from calibration.lens.fit.coverage import Coverage, coverage_of, seen_at, spread_deg
 from calibration.lens.fit.lens_adjustment import BRIEF
 from calibration.lens.fit.lens_fit import (
     FEWEST_CORNERS,
@@ -25,13 +25,124 @@ from calibration.lens.fit.lens_fit import (
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture
 from calibration.lens.fit.lens_parameters import AS_STATED, BOARD_BLOCKS, BoardFreedom, board_as_stated
 from calibration.lens.fit.lens_start import StartError, start
-from calibration.lens.fit.model_selection import ModelCandidate, difference_px, inliers_of_rich_models, select_model
+from calibration.lens.fit.model_selection import (
+    ModelCandidate,
+    ModelSelection,
+    beyond_noise,
+    cell_means,
+    difference_px,
+    inliers_of_rich_models,
+    select_model,
+)
 from calibration.lens.fit.projection_map import Difference, ProjectionMap, difference, projection_map
-from calibration.lens.fit.view_equations import BEND_PROBABLE, ViewEquations, scattered
-from calibration.lens.intrinsics_result import Intrinsics, Origins
-from calibration.lens.model_uncertainty import estimate_model_uncertainty
+from calibration.lens.fit.view_equations import BEND_PROBABLE, Scatter, ViewEquations, scattered
 from calibration.terms.surveyed import pose_of
 from geometry.arrays import Array, Bools
+from geometry.camera import camera_matrix
+
+# Error of the lens model itself, from correlated residuals and from the other models.
+#
+# The covariance of the parameters contains the noise of the corners, but not the error of a model that cannot describe
+# the lens. Two figures show such an error. First, the mean residuals in cells of the picture, which are noise if the
+# model is right. Second, the difference to the other models, weighted with their probabilities (see
+# `calibration/lens/fit/model_selection.py`). Both are added to the stated uncertainty. Ours.
+
+
+@dataclass(frozen=True, slots=True)
+class ModelUncertainty:
+    """Model error beyond the covariance of the parameters."""
+
+    p_value: float  # of mean residuals at least as large, if they are noise
+    left_px: float  # RMS per coordinate of correlated residuals beyond noise; 0 where not significant
+    between_px: float  # RMS difference to the other models where corners were seen, by their probabilities
+    factor: float  # on the sigmas of the lens, so that they include both
+
+
+def estimate_model_uncertainty(
+    table: CornerTable,
+    found: LensFit,
+    selection: ModelSelection,
+    at: ProjectionMap,
+    covariance: Array,
+    scatter: float = 1.0,
+) -> ModelUncertainty:
+    """Model error of a lens with parameter covariance (p, p), over the part of the picture where corners were seen.
+
+    scatter: factor by which photographs scatter more than noise explains. Errors that are correlated within a
+    photograph also enlarge the means of cells, and are already in the covariance.
+    """
+    noise = min([found.sigma_px, *(r.fit.sigma_px for r in selection.candidates if r.fit is not None)])
+    cells, count = cell_means(table, found)
+    p, left = beyond_noise(cells, count, noise * scatter)
+    inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
+    between = selection.chosen.model_error_px
+    claimed = float(np.mean(np.trace(at.covariance_px2(covariance)[inside], axis1=-2, axis2=-1))) if inside.any() else 0
+    factor = float(np.sqrt(1 + (between**2 + 2 * left**2) / claimed)) if claimed > 0 else 1.0
+    return ModelUncertainty(p, left, between, factor)
+
+
+# The result of a camera's calibration: the lens, its covariance and the quality figures.
+
+
+@dataclass(frozen=True, slots=True)
+class Origins:
+    """Comparison of photographs of two origins (folders, videos, first parts of names)."""
+
+    names: tuple[str, str]
+    difference: Difference
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A calibrated lens with its quality figures."""
+
+    table: CornerTable
+    model: LensModel
+    fit: LensFit
+    parameters: tuple[str, ...]  # fx, fy, cx, cy, k1 ...
+    covariance: Array  # (p, p) in that order; with scatter between photographs, an unsolved bend and model error
+    model_uncertainty: ModelUncertainty
+    correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
+    scatter: Scatter
+    held_out_rms_px: float  # per coordinate, of corners in photographs that the lens was predicted without
+    selection: ModelSelection
+    board: BoardTest | None  # None where the photographs do not determine the board's bend
+    halves: Difference | None  # None where one half does not determine the lens
+    origins: Origins | None  # None where all photographs have the same origin
+    map: ProjectionMap
+    distance_m: float
+    coverage: Coverage
+
+    @property
+    def warp(self) -> WarpTest | None:
+        """The test for a bent board; None where the views do not determine it."""
+        return None if self.board is None else self.board.warp
+
+    @property
+    def matrix(self) -> Array:
+        """(3, 3), px."""
+        return camera_matrix(self.fit.lens[:4])
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """Distortion coefficients in OpenCV's order, as many as the model has."""
+        return tuple(float(v) for v in self.fit.lens[4 : 4 + self.model.coefficients])
+
+    @property
+    def sigmas(self) -> Array:
+        """(p,): 1 sigma of each parameter."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def rms_px(self) -> float:
+        """RMS of the residuals of the used corners, per coordinate."""
+        return float(np.sqrt(np.mean(self.fit.residuals[self.fit.used] ** 2)))
+
+    @property
+    def rms_2d_px(self) -> float:
+        """RMS per corner, as OpenCV reports it: sqrt(2) times larger."""
+        return self.rms_px * float(np.sqrt(2))
+
 
 FEWEST_VIEWS = 4
 # With a smaller angle between the boards' normals, focal length and distance cannot be separated.

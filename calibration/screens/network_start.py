@@ -251,7 +251,8 @@ def chain(
     while True:
         before = len(cameras) + len(placed) + len(screens)
         for p, (s, screen_from_board) in fixed.items():
-            if s in screens and p not in placed and not _is_observed(boards, p, cameras):
+            # The pose of a board that a camera with a known pose sees is more accurate from there.
+            if s in screens and p not in placed and not any(seen == p and c in cameras for c, seen in boards):
                 placed[p] = screens[s] @ screen_from_board
             elif p in placed and s not in screens:
                 screens[s] = placed[p] @ screen_from_board.inverse()
@@ -325,11 +326,6 @@ def _screen_from_board(middle: Array, offset_m: float) -> Pose:
     """Pose of a board in the frame of the screen that it defines: origin below its middle, x along its x, z out."""
     R = np.diag([1.0, -1.0, -1.0])
     return Pose(R, np.array([0.0, 0.0, offset_m]) - R @ middle)
-
-
-def _is_observed(boards: Mapping[tuple[int, int], Pose], placement: int, cameras: Mapping[int, Pose]) -> bool:
-    """Whether a camera with a known pose sees the board, from which the board's pose is more accurate."""
-    return any(p == placement and c in cameras for c, p in boards)
 
 
 def _unconnected(lost: list[str], reached: list[str], boards: Mapping[tuple[int, int], Pose], names: list[str]) -> str:

@@ -22,6 +22,7 @@ from calibration.screens.network_start import (
     start_of,
 )
 from geometry.arrays import Array, Bools, Ints, skew
+from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import BOW, POSE
 
@@ -311,29 +312,37 @@ def spot_sigmas(result: FittedScreens, screen: int) -> Array:
     return np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, C, J), 0.0))
 
 
-def camera_sigmas(result: FittedScreens) -> dict[str, tuple[float, float]]:
-    """Sigmas of each camera's position (m) and attitude (rad), each the root of the sum over three axes."""
-    names, C = result.fit.covariance.names, np.diagonal(result.fit.covariance.matrix)
-    out = {}
-    for camera in result.network.rig.cameras:
-        at = [names.index(f"cameras.{camera}.{p}") for p in POSE]
-        out[camera] = (float(np.sqrt(C[at[:3]].sum())), float(np.sqrt(C[at[3:]].sum())))
-    return out
+def camera_covariance(result: FittedScreens, camera: str) -> Array:
+    """The covariance (6, 6) of a camera's camera_from_world."""
+    names = result.fit.covariance.names
+    at = [names.index(f"cameras.{camera}.{p}") for p in POSE]
+    return result.fit.covariance.matrix[np.ix_(at, at)]
+
+
+def camera_sigmas(camera: Camera, covariance: Array) -> tuple[float, float]:
+    """Sigmas of a camera's place in the world (m) and of its attitude (rad), RMS per axis.
+
+    covariance (6, 6): of its camera_from_world. The place c is -R^T t: errors of t act through R^T, and R Exp(theta)
+    gives c - theta x c.
+    """
+    centre = camera.camera_from_world.inverse().translation
+    J = np.concatenate([-camera.camera_from_world.rotation.T, skew(centre)], axis=1)
+    variances = np.diagonal(J @ covariance @ J.T), np.diagonal(covariance)[3:]
+    place, attitude = (float(np.sqrt(np.mean(np.maximum(v, 0.0)))) for v in variances)
+    return place, attitude
 
 
 def pointing_sigmas_m(result: FittedScreens) -> dict[str, float]:
     """Displacement, m (1 sigma, RMS of both directions), of the centre of each camera's screen by the pose's error."""
     out = {}
-    names, C = result.fit.covariance.names, result.fit.covariance.matrix
     for name, camera in result.fit.rig.cameras.items():
         screen = result.fit.rig.screens[camera.screen]
         X = screen.world_from_screen.translation
         x_c = camera.camera_from_world.apply(X)
-        at = [names.index(f"cameras.{name}.{p}") for p in POSE]
         R = camera.camera_from_world.rotation
         J = np.concatenate([np.eye(3), -R @ skew(X)], axis=1)
         across = np.eye(3) - np.outer(x_c, x_c) / (x_c @ x_c)
-        moved = across @ J @ C[np.ix_(at, at)] @ J.T @ across.T
+        moved = across @ J @ camera_covariance(result, name) @ J.T @ across.T
         out[name] = float(np.sqrt(max(np.trace(moved) / 2, 0.0)))
     return out
 

@@ -62,6 +62,11 @@ class SolveLimits:
     p_false_alarm: float = 1e-5  # probability that a correct set of spots fails the chi-square test
     min_outlier_px: float = 0.1  # smallest residual of an outlier: smaller ones are errors of the model
 
+    def hold(self, covariance: Array) -> Bools:
+        """Whether the sigmas of poses with covariances (..., 6, 6) are within the limits in all directions."""
+        m, rad = (np.sqrt(np.linalg.eigvalsh(covariance[..., i, i])[..., -1]) for i in (slice(0, 3), slice(3, 6)))
+        return np.asarray((m <= self.max_sigma_m) & (rad <= self.max_sigma_rad))
+
 
 @dataclass(frozen=True, slots=True)
 class PoseFit:
@@ -295,11 +300,7 @@ def covariances_of(H: Array) -> tuple[Array, Bools]:
 
 def is_measurement(fit: PoseFit, limits: SolveLimits) -> bool:
     """Whether a fit is a measurement of the pose: full rank, and no sigma of any direction above the limits."""
-    if not fit.observable:
-        return False
-    worst_m = np.sqrt(np.linalg.eigvalsh(fit.covariance[:3, :3])[-1])
-    worst_rad = np.sqrt(np.linalg.eigvalsh(fit.covariance[3:, 3:])[-1])
-    return bool(worst_m <= limits.max_sigma_m and worst_rad <= limits.max_sigma_rad)
+    return fit.observable and bool(limits.hold(fit.covariance))
 
 
 def pixel_covariance(J: Array, covariance: Array) -> Array:

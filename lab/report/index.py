@@ -18,7 +18,7 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from geometry.arrays import Array
+from geometry.arrays import Array, true_ranges
 from lab.errors import BeamposeError
 from lab.files.run.results import read_result_table, read_summary
 from lab.files.text.atomic_write import atomic_write_text
@@ -211,7 +211,7 @@ def _thumbnail_path(y: Array, span: tuple[float, float], scale: float, points: i
     xs = np.rint(x * ((WIDTH - 1) / max(n - 1, 1)))
     ys = np.rint(HEIGHT / 2 - (y - (span[0] + span[1]) / 2) * scale)
     out = []
-    for start, stop in svg.true_ranges(np.isfinite(ys)):
+    for start, stop in true_ranges(np.isfinite(ys)):
         dx, dy = np.diff(xs[start:stop]).astype(int), np.diff(ys[start:stop]).astype(int)
         out.append(f"M{xs[start]:.0f} {ys[start]:.0f}{_steps(dx.tolist(), dy.tolist())}")
     return "".join(out)

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
 
-from lab.files.run.results import REFINED
+from lab.files.run.results import REFINED, ListedEvent
 from lab.findings.finding import Finding, Level
 
 T = TypeVar("T")
@@ -37,18 +37,6 @@ class VerdictText:
 
 
 @dataclass(frozen=True, slots=True)
-class NotedEvent:
-    """Something that the run itself recorded."""
-
-    frame: int
-    kind: str = "noted"
-    camera: str | None = None  # None: of the whole rig
-    spot: str | None = None
-    text: str = ""
-    last_frame: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class InputFile:
     """The fingerprint of a file that the run was made from."""
 
@@ -68,7 +56,7 @@ class RunSummary:
     stated_method: str  # as written; empty where it is not stated
     verdict: VerdictText
     notes: tuple[str, ...]
-    events: tuple[NotedEvent, ...]
+    events: tuple[ListedEvent, ...]
     event_counts: dict[str, int]  # by kind
     found_again: int | None  # times the vehicle was found again after it was lost; None: not stated
     no_image: dict[str, list[tuple[int, int]]]  # by camera: first and last frame number of each range
@@ -93,7 +81,7 @@ def summary_of(tree: Mapping[str, Any]) -> RunSummary:
         stated_method=str(method or ""),
         verdict=verdict_of(tree),
         notes=tuple(map(str, _list(tree.get("notes")))),
-        events=tuple(e for x in _list(tree.get("events")) if (e := valid(NotedEvent, x))),
+        events=tuple(e for x in _list(tree.get("events")) if (e := valid(ListedEvent, x))),
         event_counts=valid(dict[str, int], counts.get("events")) or {},
         found_again=valid(int, counts.get("found_again")),
         no_image=valid(dict[str, list[tuple[int, int]]], counts.get("no_image")) or {},

@@ -155,16 +155,6 @@ def effect_columns() -> tuple[str, ...]:
     return ("parameter", "group", "sigma", "unit", *(f"{kind}_{a}" for kind in ("median", "largest") for a in AXES))
 
 
-def write_plan(plan: Plan, path: Path) -> None:
-    """Write plan.csv, complete or not at all. Numbers that do not exist are empty."""
-    write_table(path, plan_columns(plan), _plan_rows(plan))
-
-
-def write_effects(plan: Plan, path: Path) -> None:
-    """Write effects.csv, complete or not at all; errors that are not there (sigma 0) have no row."""
-    write_table(path, effect_columns(), _effect_rows(plan))
-
-
 def _plan_rows(plan: Plan) -> Iterator[list[str]]:
     least = np.where(plan.seen, plan.margin_px, np.inf).min(axis=1)
     columns = [least[:, None], plan.closest_px[:, None], plan.condition[:, None], plan.sigma, plan.worst]
@@ -470,8 +460,8 @@ def _solve(rig_path: Path, options: PlanOptions) -> Solved[Plan]:
     sigma_m, sigma_deg = median_sigma(plan)
 
     def write(folder: Path) -> None:
-        write_plan(plan, folder / TABLE)
-        write_effects(plan, folder / EFFECTS)
+        write_table(folder / TABLE, plan_columns(plan), _plan_rows(plan))
+        write_table(folder / EFFECTS, effect_columns(), _effect_rows(plan))
 
     return Solved(
         name="plan",

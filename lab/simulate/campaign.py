@@ -103,12 +103,11 @@ class Campaign:
 def draw_campaign(seed: int, rig: str | Rig = "fan", quality: CampaignQuality | None = None) -> Campaign:
     """The truth and the measurements of one campaign, from a seed.
 
-    rig: a name of RIGS, or a rig. Raises InputError: no rig has this name.
+    rig: a name of RIGS, the path of a rig.yaml, or a rig. Raises InputError: there is no such rig or file, or the file
+    is wrong.
     """
     q = CampaignQuality() if quality is None else quality
-    if isinstance(rig, str) and rig not in RIGS:
-        raise InputError(f"rig: expected a rig's name, got {rig!r}{suggest_name(rig, RIGS)}")
-    nominal = RIGS[rig]() if isinstance(rig, str) else rig
+    nominal = rig if isinstance(rig, Rig) else RIGS[rig]() if rig in RIGS else _designed(rig)
     truth = as_mounted(nominal, q, np.random.default_rng([seed, _MOUNTING]))
     lenses = {
         n: _lens(c, q, np.random.default_rng([seed, _LENSES, i])) for i, (n, c) in enumerate(truth.cameras.items())
@@ -131,7 +130,7 @@ def draw_campaign(seed: int, rig: str | Rig = "fan", quality: CampaignQuality | 
     _, pixels = _some_wrong(pixels, q.wrong, rng)
     wrong_spots, spot_pixels = _some_wrong(spots.pixels, q.wrong, rng)
     return Campaign(
-        name=rig if isinstance(rig, str) else "rig",
+        name=rig if isinstance(rig, str) and rig in RIGS else "rig",
         seed=seed,
         quality=q,
         nominal=nominal,
@@ -312,7 +311,7 @@ def simulate_calibration(
     if positions < 3:
         raise InputError(f"positions: expected 3 or more, got {positions}")
     q = replace(CampaignQuality() if quality is None else quality, positions=positions, wrong=wrong)
-    campaign = draw_campaign(seed, rig if rig in RIGS else _designed(rig), q)
+    campaign = draw_campaign(seed, rig, q)
     with atomic_folder(Path(out), lambda _: False) as folder:
         write_campaign(campaign, folder)
         if photos:
@@ -321,10 +320,7 @@ def simulate_calibration(
 
 
 def _designed(rig: str) -> Rig:
-    """The rig of a rig.yaml; a word that names no file and no rig is taken for a misspelt name.
-
-    Raises InputError: there is no such rig or file, or the file is wrong.
-    """
+    """The rig of a rig.yaml; a word that names no file and no rig is taken for a misspelt name."""
     if not Path(rig).exists():
         raise InputError(f"rig: expected a rig.yaml or a rig's name, got {rig!r}{suggest_name(rig, RIGS)}")
     return load_rig(Path(rig))

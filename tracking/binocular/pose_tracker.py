@@ -9,7 +9,7 @@ import numpy as np
 from geometry.arrays import Array, Ints, symmetric
 from geometry.camera import in_picture
 from geometry.pose import Pose
-from geometry.pose_solver.gauss_newton import PoseFit
+from geometry.pose_solver.gauss_newton import PoseFit, SolveLimits
 from geometry.uncertainty.chi_square import chi2_tail
 from tracking.binocular.acquisition import (
     Images,
@@ -34,6 +34,7 @@ from tracking.statuses import LOST_SIGMA_M, LOST_SIGMA_RAD, PoseStatus
 # measurement. Source: ours.
 
 
+_KNOWN = SolveLimits(LOST_SIGMA_M, LOST_SIGMA_RAD)  # poses that are not lost
 _MOST_PRIOR_NATS = 20.0  # a target that jumps is found: the motion never outweighs two images
 _TRUSTED_P, _TRUSTED_SHARE = 1e-3, 0.75  # misfit and share of explained images without a search from scratch
 
@@ -121,8 +122,7 @@ class BinocularTracker:
     def _predicted(self, motion: RigidMotion, dt_s: float) -> RigidMotion | None:
         """The motion after a time; None where it is too uncertain."""
         ahead = motion.predicted(dt_s, self._p.acceleration_m_s2, self._p.turn_rad_s2)
-        worst = np.sqrt([np.linalg.eigvalsh(ahead.covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
-        return ahead if worst[0] <= LOST_SIGMA_M and worst[1] <= LOST_SIGMA_RAD else None
+        return ahead if _KNOWN.hold(ahead.covariance) else None
 
     def _candidates(self, images: Images, ahead: RigidMotion | None) -> list[LabelledPose]:
         """Poses that explain the images: near the prediction, and from scratch where that is not convincing."""
@@ -163,8 +163,7 @@ class BinocularTracker:
             return NO_POSE
         if self._contradicted(best) or self._shows_another(best):
             return CONTRADICTED
-        worst = np.sqrt([np.linalg.eigvalsh(best.fit.covariance[s, s])[-1] for s in (slice(0, 3), slice(3, 6))])
-        if worst[0] > LOST_SIGMA_M or worst[1] > LOST_SIGMA_RAD:
+        if not _KNOWN.hold(best.fit.covariance):
             return WEAK
         return AMBIGUOUS if rivals else ""
 

@@ -377,7 +377,8 @@ def _oblique_fit(
     final = _solve(once[0], again, 0.0, oblique=True)
     if final is None or np.mean(final[1] > 0) < _ELLIPSE_COVERAGE:
         return None
-    independent = max(_independent(again, final[1]) - 5, 1.0)
+    together = max(CORRELATED_PX / max(again.spacing_px, 0.3), 1.0)  # points with one error
+    independent = max(float(np.count_nonzero(final[1])) / together - 5, 1.0)
     gained = before / max(_sum_of_squares(final[0], again, final[1]), 1e-12) - 1
     return _without_ends(once[0], again, final, oblique=True) if 0.5 * gained * independent > _ELLIPSE_F else None
 
@@ -402,10 +403,6 @@ def _residuals(rim: Rim, points: RimPoints) -> Array:
     """Residuals (n,) of the last step; nan without an edge. The rays start at the rim's old centre, at most 1e-2 px
     from the new one after three passes."""
     return points.radius_px - rim.radius_at(points.theta)
-
-
-def _independent(points: RimPoints, weight: Array) -> float:
-    return float(np.count_nonzero(weight)) / max(CORRELATED_PX / max(points.spacing_px, 0.3), 1.0)
 
 
 def _described(

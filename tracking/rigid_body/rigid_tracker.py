@@ -393,8 +393,7 @@ class RigidTracker:
             return True
         if not np.isfinite(d).all():
             return False
-        worst = [np.sqrt(np.linalg.eigvalsh(covariance[i, i])[-1]) for i in (slice(0, 3), slice(3, 6))]
-        return bool(worst[0] <= self.limits.max_sigma_m and worst[1] <= self.limits.max_sigma_rad)
+        return bool(self.limits.hold(covariance))
 
     # -- online estimates ---------------------------------------------------------------------------------------------
 

@@ -215,18 +215,16 @@ def _without_resting(blocks: Sequence[Block], min_spots: int) -> Sequence[Block]
     names = {name for block in blocks for name in block[HERE]}
     seen = {name: [_with_neighbours(block, name) for block in blocks if name in block[HERE]] for name in names}
     places = resting_places(seen, min_spots, RESTING)
-    return [[_elsewhere(frame, places) for frame in block] for block in blocks]
+    return [
+        [{name: of[~at_places(of.uv_px, places.get(name, NOWHERE))] for name, of in frame.items()} for frame in block]
+        for block in blocks
+    ]
 
 
 def _with_neighbours(block: Block, name: str) -> Three:
     """A camera's points in a frame, and in those before and after it."""
     before, here, after = (block[k].get(name, Detections.none()).uv_px for k in (0, HERE, -1))
     return before, here, after
-
-
-def _elsewhere(frame: Mapping[str, Detections], places: Mapping[str, Array]) -> dict[str, Detections]:
-    """The points of a frame that are at none of these places of their camera."""
-    return {name: found[~at_places(found.uv_px, places.get(name, NOWHERE))] for name, found in frame.items()}
 
 
 def _moved(one: Mapping[str, Detections], other: Mapping[str, Detections]) -> int:

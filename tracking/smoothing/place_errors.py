@@ -176,30 +176,15 @@ def more_of_means(uv_px: Array, reach_px: float, averaged: Array) -> Array:
     return out
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Products:
     """Sums over pairs of frames of the products of a view's residuals, divided by their mean square."""
 
     reach_px: Array  # (n,) assumed correlation length
     same_error_frames: Array  # (T, n) number of frames with the same errors
-    near: float  # weighted with the correlation of their places
-    expected: float  # the same if all errors belonged to places
-    elsewhere: float  # mean over pairs in different places, as far as significant
-
-    @property
-    def significance(self) -> float:
-        """`near` in standard deviations of its distribution for white residuals in two coordinates."""
-        return self.near / np.sqrt(0.5 * self.expected) if self.expected > 0 else 0.0
-
-
-@dataclass(slots=True)
-class _Sums:
-    """Of one assumed correlation length, as in `_Products`."""
-
-    same_error_frames: Array
-    near: float = 0.0
-    expected: float = 0.0
-    far: float = 0.0  # products of pairs in different places
+    near: float = 0.0  # weighted with the correlation of their places
+    expected: float = 0.0  # the same if all errors belonged to places
+    far: float = 0.0  # of pairs in different places
     far_pairs: float = 0.0
     independent: float = 0.0  # those of them that are independent of each other
 
@@ -215,16 +200,23 @@ class _Sums:
         self.near += 0.5 * float(np.sum(rho * products))
         self.expected += 0.5 * float(np.sum(rho**2))
 
-    def products(self, reach_px: Array) -> _Products:
-        """The complete sums."""
-        # Less one sigma: a spot that hardly moves shows few places that differ, and their errors may agree by chance.
-        elsewhere = self.far / self.far_pairs - np.sqrt(0.5 / self.independent) if self.far_pairs else 0.0
-        return _Products(reach_px, self.same_error_frames, self.near, self.expected, max(elsewhere, 0.0))
+    @property
+    def significance(self) -> float:
+        """`near` in standard deviations of its distribution for white residuals in two coordinates."""
+        return self.near / np.sqrt(0.5 * self.expected) if self.expected > 0 else 0.0
+
+    @property
+    def elsewhere(self) -> float:
+        """Mean over pairs in different places, as far as significant.
+
+        Less one sigma: a spot that hardly moves shows few places that differ, and their errors may agree by chance.
+        """
+        return max(self.far / self.far_pairs - np.sqrt(0.5 / self.independent), 0.0) if self.far_pairs else 0.0
 
 
 def _products(residual: Array, uv_px: Array, reaches_px: Sequence[Array], taken: Array) -> list[_Products]:
     """For each of several assumed correlation lengths (n,)."""
-    sums = [_Sums(np.ones(residual.shape[:2])) for _ in reaches_px]
+    sums = [_Products(reach_px, np.ones(residual.shape[:2])) for reach_px in reaches_px]
     for view in range(residual.shape[1]):
         rows = np.flatnonzero(np.isfinite(residual[:, view]).all(axis=-1))
         lost = 2 * float(np.mean(taken[rows, view])) if len(rows) else 0.0
@@ -236,6 +228,6 @@ def _products(residual: Array, uv_px: Array, reaches_px: Sequence[Array], taken:
             r, at = residual[some, view], uv_px[some, view]
             products = (r @ r.T + lost) / mean_square
             distance = _distances(at)
-            for one, reach_px in zip(sums, reaches_px, strict=True):
-                one.add(some, view, products, correlation(distance, reach_px[view]))
-    return [one.products(reach_px) for one, reach_px in zip(sums, reaches_px, strict=True)]
+            for one in sums:
+                one.add(some, view, products, correlation(distance, one.reach_px[view]))
+    return sums

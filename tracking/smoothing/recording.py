@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, true_ranges
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
@@ -263,10 +263,9 @@ def track_backward(rec: TrackedRecording, motion: SmoothedMotion, weak: Bools, s
     motion: the present estimate, from which the tracks start.
     """
     out = BackwardLabels(len(rec), len(rec.model))
-    for first, last in _stretches(weak):
-        if last - first + 1 < MIN_FRAMES or last + 1 >= len(rec) or not sure[last + 1]:
-            continue
-        _track_stretch(rec, motion, first, last, out)
+    for first, end in true_ranges(weak):
+        if end - first >= MIN_FRAMES and end < len(rec) and sure[end]:
+            _track_stretch(rec, motion, first, end - 1, out)
     return out
 
 
@@ -290,12 +289,6 @@ def _track_stretch(rec: TrackedRecording, motion: SmoothedMotion, first: int, la
             d = tracked.pose.minus(Pose(poses[k, :3], poses[k, 3]))
             spread = tracked.pose_covariance + np.eye(6) * 1e-12
             out.disagrees[k] = bool(out.measured[k] and d @ np.linalg.solve(2 * spread, d) > DISAGREEMENT_CHI2)
-
-
-def _stretches(mask: Bools) -> list[tuple[int, int]]:
-    """First and last index of each stretch of True, the last stretch first."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)][::-1]
 
 
 def merged(causal: Ints, backward: BackwardLabels, weak: Bools, spot_of: Ints) -> Ints:

@@ -58,8 +58,7 @@ def single_frame_poses(
         rows = np.flatnonzero(fits.spots >= 3)
         covariance, full_rank = covariances_of(fits.information[rows])
         rows, covariance = rows[full_rank], covariance[full_rank]
-        worst = [np.sqrt(np.linalg.eigvalsh(covariance[:, i, i])[:, -1]) for i in (slice(0, 3), slice(3, 6))]
-        good = (worst[0] <= limits.max_sigma_m) & (worst[1] <= limits.max_sigma_rad)
+        good = limits.hold(covariance)
         rows, covariance = rows[good], covariance[good]
         at, b = start + rows, beside[start + rows]
         out.measured[at] = True

@@ -14,12 +14,12 @@ from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_models import LENS_MODELS, named
 from calibration.lens.intrinsics import (
     FEWEST_VIEWS,
+    Intrinsics,
     IntrinsicsError,
     IntrinsicsOptions,
     TooFewViewsError,
     calibrate_intrinsics,
 )
-from calibration.lens.intrinsics_result import Intrinsics
 from geometry.arrays import Array
 from geometry.camera import FISHEYE, PERSPECTIVE
 from geometry.uncertainty.rig_uncertainty import RigCovariance

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.lens.fit.lens_models import folds_in_picture
 from calibration.lens.fit.model_selection import OVERFIT, UNKNOWN_PX
 from calibration.lens.fit.projection_map import Difference
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics import Intrinsics
 from geometry.arrays import Array
 from lab.calibrate.camera.photos import VIDEO_SUFFIXES, PhotoSet, as_8_bit
 from lab.findings.finding import Finding, Level, finding, level_above, passed

@@ -11,8 +11,13 @@ import numpy as np
 
 from calibration.boards.board_types import Board
 from calibration.lens.fit.lens_models import named
-from calibration.lens.intrinsics import FEWEST_VIEWS, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics import (
+    FEWEST_VIEWS,
+    Intrinsics,
+    IntrinsicsError,
+    IntrinsicsOptions,
+    calibrate_intrinsics,
+)
 from calibration.pair import CalibratedPair, PairError, calibrate_pair
 from geometry.arrays import Array
 from lab.calibrate.camera.camera import LENSES, corner_table

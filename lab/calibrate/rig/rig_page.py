@@ -10,15 +10,16 @@ import numpy as np
 from calibration.rig.joint import DOTS, LEAST_REDUNDANCY, LOST, P_MISFIT, RECORDS, SPOTS, Joint
 from calibration.rig.rig_figures import ExpectedPose, HoldOut, RigCalibration, in_degrees, in_mm
 from calibration.screens.network import FRAMES
+from calibration.screens.screens import camera_sigmas
 from calibration.terms.rig_blocks import POSES, STAND, lines_in, stacks_of
 from calibration.terms.surveyed import pose_of
-from geometry.arrays import Array, Bools, Ints, skew
+from geometry.arrays import Array, Bools, Ints
 from geometry.pose import ypr_sigmas
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import split_name
 from lab.calibrate.beams.beams_page import ARCSEC, WORST_NAMED, bad_positions, beam_table
 from lab.findings.finding import Finding, Level, entries, finding, level_above, passed
-from lab.number_format import format_number, format_some
+from lab.number_format import format_number, format_some, format_vector
 from lab.report.calibration.calibration_drawings import (
     correlation_matrix,
     flatness_map,
@@ -382,7 +383,7 @@ def _screens(o: CalibratedRig) -> Section | None:
             along = float(np.sqrt(np.maximum(normal @ C[:3, :3] @ normal, 0.0)))
             tilt = float(np.sqrt(np.maximum(C[3, 3] + C[4, 4], 0.0) / 2))
         bow = float(sigmas.get(f"screens.{name}.bow_xx_per_m", 0.0))
-        place = ", ".join(f"{v:.4f}" for v in screen.world_from_screen.translation)
+        place = format_vector(screen.world_from_screen.translation, 4)
         surface = "bent" if any(screen.bow) else "flat"
         rows.append((name, place, 1e3 * along, np.rad2deg(tilt), surface, 1e3 * bow or None))
     heads = ("screen", "origin (m)", "sigma along its normal (mm)", "sigma of its tilt (deg)", "surface",
@@ -424,20 +425,16 @@ def _cameras(o: CalibratedRig) -> Section:
     rows = []
     for i, (name, camera) in enumerate(joint.rig.cameras.items()):
         at = joint.unknowns.column["cameras"][i]
-        C = joint.all_covariance[np.ix_(at, at)]
-        # The centre c is -R^T t: errors of t act through R^T, and R Exp(theta) gives c - theta x c.
-        centre = camera.camera_from_world.inverse().translation
-        J = np.concatenate([-camera.camera_from_world.rotation.T, skew(centre)], axis=1)
-        mm = 1e3 * np.sqrt(np.mean(np.maximum(np.diagonal(J @ C @ J.T), 0.0)))
-        deg = np.rad2deg(np.sqrt(np.mean(np.diagonal(C)[3:])))
+        place_m, turn = camera_sigmas(camera, joint.all_covariance[np.ix_(at, at)])
         fx, sigma = camera.matrix[0, 0], sigmas.get(f"cameras.{name}.fx", 0.0)
-        place = ", ".join(f"{v:.4f}" for v in centre)
-        rows.append((name, place, mm, deg, fx, sigma, fx - before.cameras[name].matrix[0, 0]))
+        place = format_vector(camera.camera_from_world.inverse().translation, 4)
+        change = fx - before.cameras[name].matrix[0, 0]
+        rows.append((name, place, 1e3 * place_m, np.rad2deg(turn), fx, sigma, change))
     heads = ("camera", "position (m)", "sigma of position (mm)", "sigma of attitude (deg)", "fx (px)",
              "sigma of fx (px)", "change of fx since the lens calibration (px)")  # fmt: skip
     words = (
-        "The errors of a camera's lens and pose are correlated: a longer focal length has nearly the same effect as a"
-        " more distant camera. rig.yaml holds the joint covariance."
+        "Sigmas are RMS per axis. The errors of a camera's lens and pose are correlated: a longer focal length has"
+        " nearly the same effect as a more distant camera. rig.yaml holds the joint covariance."
     )
     return Section("Cameras", words, (), PageTable(heads, rows))
 

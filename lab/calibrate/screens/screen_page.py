@@ -13,6 +13,7 @@ from calibration.screens.network import classify_outliers
 from calibration.screens.screens import (
     ApproximatePosition,
     FittedScreens,
+    camera_covariance,
     camera_sigmas,
     pointing_sigmas_m,
     spot_sigmas,
@@ -292,19 +293,18 @@ def _distance(result: FittedScreens, camera: str) -> float:
 
 def _places(result: FittedScreens) -> Section:
     fit, network = result.fit, result.network
-    sigmas = camera_sigmas(result)
     pointing = pointing_sigmas_m(result)
     rows = []
     for i, (name, c) in enumerate(fit.rig.cameras.items()):
-        x, y, z = c.camera_from_world.inverse().translation.tolist()
         mine = network.point_observations.camera_of == i
         boards = 0 if fit.corners is None else len(set(fit.corners.placement[fit.corners.camera == i].tolist()))
-        position, attitude = sigmas[name]
-        place = [name, c.screen, f"{x:.4f}, {y:.4f}, {z:.4f}", 1e3 * position, float(np.degrees(attitude))]
-        rows.append([*place, 1e3 * pointing[name], f"{int(np.sum(fit.used & mine))} of {int(mine.sum())}", boards])
+        position, attitude = camera_sigmas(c, camera_covariance(result, name))
+        place = format_vector(c.camera_from_world.inverse().translation, 4)
+        known = [name, c.screen, place, 1e3 * position, float(np.degrees(attitude))]
+        rows.append([*known, 1e3 * pointing[name], f"{int(np.sum(fit.used & mine))} of {int(mine.sum())}", boards])
     words = (
-        "Errors of a camera's position and attitude are correlated and partly cancel on its screen. The column “on its"
-        " screen” is the combined effect, from the joint covariance in screens.yaml."
+        "Sigmas are RMS per axis. Errors of a camera's position and attitude are correlated and partly cancel on its"
+        " screen. The column “on its screen” is the combined effect, from the joint covariance in screens.yaml."
     )
     heads = [
         "camera", "screen", "position in world (m)", "sigma of position (mm)", "sigma of attitude (°)",

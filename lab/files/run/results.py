@@ -28,6 +28,18 @@ ABSENT = -1  # the status code where the file has no row
 SUMMARY_SCHEMA = "beampose/summary/1"  # of a run's summary.json
 
 
+@dataclass(slots=True)
+class ListedEvent:
+    """An event as summary.json lists it; one that continues in the next frames has a later last frame."""
+
+    frame: int
+    last_frame: int | None = None
+    kind: str = "noted"
+    camera: str | None = None  # None: of the whole rig
+    spot: str | None = None
+    text: str = ""
+
+
 def read_result_table(path: Path, names: Iterable[str]) -> Table:
     """The named columns of a table of results; those beyond the contract are nan where the file does not have them.
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, evenly_spread
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Rig
@@ -152,7 +152,7 @@ def largest_disagreement_px(truth: TruthTables, rig: Rig) -> tuple[float, int] |
     shared = np.intersect1d(truth.pose.frame, truth.spots.frame)
     if not shared.size:
         return None
-    frames: Ints = shared[np.unique(np.linspace(0, len(shared) - 1, MAX_COMPARED_FRAMES).astype(np.int64))]
+    frames = evenly_spread(shared, MAX_COMPARED_FRAMES)
     at = np.searchsorted(truth.pose.frame, frames)
     model = SpotModel.of(rig)
     pixels, _ = model.project(Pose.from_quaternion(truth.pose.quaternion_wxyz[at], truth.pose.position_m[at]))

@@ -73,7 +73,7 @@ def _kind_of(hint: Any) -> Any:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         inner = next(a for a in arguments if a is not type(None))
-        return Annotated[_kind_of(inner) | None, pydantic.WrapValidator(_nothing_or)]
+        return Annotated[_kind_of(inner) | None, pydantic.WrapValidator(lambda v, of: None if v is None else of(v))]
     if origin is typing.Literal:
         return Annotated[Any, pydantic.PlainValidator(fields.one_of(arguments))]
     if origin is tuple:
@@ -91,10 +91,6 @@ def _kind_of(hint: Any) -> Any:
     if hint not in kinds:
         raise TypeError(f"a parameter of type {hint} cannot be read from a file")
     return kinds[hint]
-
-
-def _nothing_or(value: Any, inner: Any) -> Any:
-    return None if value is None else inner(value)
 
 
 def _number_tuple(value: Any) -> tuple[float, ...]:

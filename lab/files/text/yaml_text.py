@@ -180,11 +180,7 @@ class OpenCVLoader(StrictLoader):
     """The strict loader, with OpenCV's matrices as mappings."""
 
 
-def _construct_tagged(loader: OpenCVLoader, _suffix: str, node: yaml.MappingNode) -> dict[Any, Any]:
-    return loader.construct_mapping(node, deep=True)
-
-
-OpenCVLoader.add_multi_constructor("tag:yaml.org,2002:opencv-", _construct_tagged)
+OpenCVLoader.add_multi_constructor("tag:yaml.org,2002:opencv-", lambda loader, _, node: _construct_map(loader, node))
 
 
 # YAML files: read safely and strictly, each mistake reported in one line; written atomically.

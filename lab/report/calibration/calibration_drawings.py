@@ -14,7 +14,7 @@ from html import escape
 import cv2
 import numpy as np
 
-from geometry.arrays import Array, Bools, robust_sigma
+from geometry.arrays import Array, Bools, evenly_spread, robust_sigma
 from lab.report.plot import svg
 from lab.report.plot.maps import BAR_WIDTH, colour_bar, colours, contour_lines, hex_colour, label_place, value_range
 
@@ -90,7 +90,7 @@ def residual_field(
     if len(found) > _MOST_VECTORS:
         # Every k-th residual, and the largest ones, which the user must be able to see.
         largest = np.argsort(np.linalg.norm(residual, axis=1))[-_MOST_VECTORS // 10 :]
-        kept = np.union1d(np.linspace(0, len(found) - 1, _MOST_VECTORS).astype(np.int64), largest)
+        kept = np.union1d(evenly_spread(np.arange(len(found)), _MOST_VECTORS), largest)
     starts = p.at(found)
     d = svg.segments(starts[kept], starts[kept] + _capped(residual[kept] * stretch))
     out.append(f'<path d="{d}" stroke="{svg.BLUE}" stroke-width="0.7" stroke-opacity="0.55" fill="none"/>')

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, true_ranges
 from lab.errors import RunError
 from lab.files.output.part_folder import removed_at_the_end
-from lab.report.plot.svg import Box, free_box, true_ranges
+from lab.report.plot.svg import Box, free_box
 
 Pixels: TypeAlias = NDArray[np.uint8]  # (h, w, 3), BGR
 Colour: TypeAlias = tuple[int, int, int]  # BGR

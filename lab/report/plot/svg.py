@@ -15,17 +15,11 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, true_ranges
 from lab.pictures.opencv import load_cv2
 from tracking.statuses import PoseStatus, SpotStatus
 
 # Long series reduced to what a screen can show, without losing extremes or gaps.
-
-
-def true_ranges(mask: Bools) -> list[tuple[int, int]]:
-    """First index and one past the last index of each run of True in (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def envelope(x: Array, y: Array, bins: int) -> tuple[Array, Array]:

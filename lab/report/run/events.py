@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from geometry.arrays import true_ranges
 from geometry.forward_model import SpotModel
 from lab.errors import BeamposeError
 from lab.files.run.run_file import DetectionsTable, LiveDevice, VideoFile
 from lab.number_format import format_count
 from lab.report.frames.content import CameraFrame, SpotMark, frame_content, result_data
 from lab.report.plot import svg
-from lab.report.plot.svg import image_uri, true_ranges
+from lab.report.plot.svg import image_uri
 from lab.report.run.report_data import ReportData
 from lab.runs.frames.frames import Recorded, pictures_at
 from tracking.statuses import PoseStatus, SpotStatus

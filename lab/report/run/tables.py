@@ -7,11 +7,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, true_ranges
 from geometry.rotations import ypr_jacobian
 from lab.number_format import format_angle, format_length, format_number, format_percent, median
 from lab.report.page import KeyFigure
-from lab.report.plot.svg import true_ranges
 from lab.report.run.report_data import ReportData
 from tracking.statuses import PoseStatus, SpotStatus
 

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, true_ranges
 from lab.findings.finding import Finding, Level, first_sentence, verdict
 from lab.number_format import format_count, format_number, format_percent, format_with_sigma
 from lab.report.plot import svg
-from lab.report.plot.svg import true_ranges
 from lab.report.run.report_data import ReportData
 from lab.report.run.tables import label_counts
 from lab.report.summary import day_of, findings_in, mappings

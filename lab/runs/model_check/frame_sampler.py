@@ -26,7 +26,7 @@ BLOCK = 3  # consecutive frames that are kept together: they give the velocities
 class EvenSampler(Generic[T]):
     """Keeps evenly spaced blocks of consecutive frames: whenever it is full, every other block is dropped."""
 
-    most: int  # frames
+    most: int = MOST_KEPT  # frames
     kept: list[T] = field(default_factory=list)
     _numbers: list[int] = field(default_factory=list)
     _stride: int = 1  # of the blocks that are kept
@@ -104,19 +104,10 @@ class SampledFrame:
 
 
 @dataclass(slots=True)
-class FrameSampler:
-    """Keeps evenly spaced blocks of consecutive frames."""
+class FrameSampler(EvenSampler[SampledFrame]):
+    """Of tracked frames, whose arrays are not copied."""
 
-    most: int = MOST_KEPT
     with_predicted: bool = False  # whether poses are kept that are not measured
-    _sampler: EvenSampler[SampledFrame] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._sampler = EvenSampler(self.most)
-
-    def add(self, frame: SampledFrame) -> None:
-        """Add the next frame. Its arrays are not copied."""
-        self._sampler.add(frame)
 
     def add_tracked(
         self,
@@ -157,7 +148,7 @@ class FrameSampler:
 
     def stretch_of_cameras(self, camera_of: Ints) -> dict[int, tuple[float, float]]:
         """By camera, how much longer its spots are along their motion; see `stretch_by_motion`. camera_of (n,)."""
-        blocks = [b for b in self._sampler.blocks if all(k.profile_px2 is not None for k in b)]
+        blocks = [b for b in self.blocks if all(k.profile_px2 is not None for k in b)]
         if not blocks:
             return {}
         uv = np.stack([[np.where(k.seen[:, None], k.uv_px, np.nan) for k in block] for block in blocks])
@@ -169,8 +160,7 @@ class FrameSampler:
 
     def recording(self) -> ModelCheckRecording | None:
         """The sampled frames; None where no frame was added."""
-        kept = self._sampler.kept
-        if not kept:
+        if not (kept := self.kept):
             return None
         n = len(kept[0].seen)
         no_pose = Pose(np.full((3, 3), np.nan), np.full(3, np.nan))

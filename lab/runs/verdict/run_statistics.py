@@ -19,6 +19,7 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
+from lab.files.run.results import ListedEvent
 from lab.number_format import format_count
 from lab.runs.frames.pipeline import FrameRecord, Pair
 from tracking.consistency import (
@@ -296,18 +297,6 @@ class CameraStatistics:
             "missing": [list(r) for r in self.missing.ranges],
             "displaced": [list(r) for r in self.displaced.ranges],
         }
-
-
-@dataclass(slots=True)
-class ListedEvent:
-    """An event as summary.json lists it; one that continues in the next frames has a later last frame."""
-
-    frame: int
-    last_frame: int
-    kind: str
-    camera: str | None
-    spot: str | None
-    text: str
 
 
 @dataclass(slots=True)

@@ -10,7 +10,7 @@ from itertools import takewhile
 import cv2
 import numpy as np
 
-from geometry.arrays import Array
+from geometry.arrays import Array, evenly_spread
 from lab.errors import InputError
 from lab.files.run.detections_file import read_detections
 from lab.files.run.run_file import DetectionsTable, RecordedSource
@@ -47,7 +47,7 @@ def annotated_pictures(results: StereoResults) -> list[tuple[str, str]]:
 
 def _chosen(results: StereoResults) -> list[StereoRecord]:
     measured, other = results.measured, [r for r in results.records if not r.measured]
-    few = [measured[int(i)] for i in np.unique(np.linspace(0, len(measured) - 1, 3).astype(int))] if measured else []
+    few = [measured[i] for i in evenly_spread(np.arange(len(measured)), 3).tolist()]
     few += other[: _MOST - len(few)]
     return sorted(few, key=lambda r: r.frame)
 

@@ -21,20 +21,18 @@ from lab.number_format import format_length, format_number
 from lab.pictures.source import open_inputs
 from lab.progress import Progress
 from lab.report.page import Section
-from lab.report.plot.series import Band, Line
-from lab.report.plot.svg import BLUE, SKY
 from lab.runs.frames.sensor_noise import noise_pictures
 from lab.runs.processed import quantiles
 from lab.runs.tables import pose_numbers
 from lab.targets.page import TimeAxis
 from lab.targets.recording import DEFAULT_RATE_HZ
+from lab.targets.stereo.page import pose_section
 from lab.targets.stereo.process import contradiction
 from lab.targets.stereo.run import GOOD_NOISE_SCALE, LARGEST_NOISE_SCALE, load_lamps, noise_scale
 from lab.targets.stereo.tables import attitude_row, covariance_rows
 from lab.targets.target import Codes, Target, Track, TrackOptions, header_rate, track_pictures
 from tracking.binocular.calibration_check import MOST_FRAMES, CalibrationCheck, LabelledFrame, check_calibration
-from tracking.binocular.lamp_corners import harris_corners
-from tracking.binocular.lamp_tracker import LampFrame, LampTracker
+from tracking.binocular.lamp_tracker import LampFrame, LampTracker, harris_corners
 from tracking.binocular.marker_model import MarkerImages, MatchParameters
 from tracking.detection.detect import find_spots
 from tracking.noise import NoiseModel, Picture
@@ -42,7 +40,6 @@ from tracking.noise_estimation.photon_transfer import estimate_noise
 from tracking.statuses import PoseStatus
 
 _MOST_LIGHTS = 60  # of a picture; the strongest
-_POSE = (("x", "m"), ("y", "m"), ("z", "m"), ("yaw", "deg"), ("pitch", "deg"), ("roll", "deg"))
 
 
 def spots(picture: Picture, noise: NoiseModel | None = None) -> MarkerImages:
@@ -179,23 +176,11 @@ class LampsTarget(Target[LampFrame]):
         ]
 
     def sections(self, track: Track[LampFrame]) -> list[Section]:
-        axis, sigmas = TimeAxis.of(track), _sigmas(track)
-        values = np.full((len(track.frames), 6), np.nan)
-        for k, frame in enumerate(track.frames):
-            if frame.tracked.pose is not None:
-                values[k] = *frame.tracked.pose.translation, *np.rad2deg(frame.tracked.pose.ypr)
-        panels = [
-            axis.panel(
-                name, unit, Line(values[:, i], BLUE, name),
-                bands=(Band.about(values[:, i], sigmas[:, i], 3.0, SKY, "3 sigma", 0.5),), wide=False,
-            )
-            for i, (name, unit) in enumerate(_POSE)
-        ]  # fmt: skip
         words = (
             "Pose of the target in the camera's frame: x to the right, y down, z ahead. Yaw, pitch and roll turn about"
-            " z, y and x, in this order."
+            " z, y and x, in this order"
         )
-        return [Section("Pose", words, panels)]
+        return [pose_section(TimeAxis.of(track), [f.tracked for f in track.frames], words)]
 
 
 def _sigmas(track: Track[LampFrame]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from lab.runs.tables import pose_numbers
 from lab.targets.page import TimeAxis
 from lab.targets.stereo.frames import annotated_pictures
 from lab.targets.stereo.run import StereoResults, TruthErrors
+from tracking.binocular.pose_tracker import BinocularFrame
+from tracking.statuses import PoseStatus
 
 _SENTENCES = (
     "The poses may be used.",
@@ -25,11 +28,13 @@ _SENTENCES = (
     "The poses must not be used as they are.",
 )
 _AXES = ("x", "y", "z")
+_POSES = "Position of the body origin and attitude (Rz(yaw) Ry(pitch) Rx(roll)) in the frame of the pair"
 
 
 def write_stereo_page(results: StereoResults, findings: tuple[Finding, ...], folder: Path) -> Path:
     """Write report.html into a folder. Returns its path."""
-    sections = [_pictures(results), _poses(results), _residuals(results), _pair(results)]
+    poses = pose_section(_axis(results), [r.tracked for r in results.records], _POSES)
+    sections = [_pictures(results), poses, _residuals(results), _pair(results)]
     if results.errors is not None:
         sections.insert(1, _truth(results, results.errors))
     run = results.run
@@ -96,28 +101,22 @@ def _axis(results: StereoResults) -> TimeAxis:
     return TimeAxis(results.t_s, "time (s)", [r.tracked.status for r in results.records])
 
 
-def _poses(results: StereoResults) -> Section:
-    n = len(results.records)
-    value, sigma = np.full((n, 6), np.nan), np.full((n, 6), np.nan)
-    for i, r in enumerate(results.records):
-        if r.tracked.pose is None or r.tracked.covariance is None:
-            continue
-        numbers = pose_numbers(r.tracked.pose, r.tracked.covariance)
-        value[i], sigma[i] = numbers[[0, 1, 2, 7, 8, 9]], numbers[10:]
+def pose_section(axis: TimeAxis, frames: Sequence[BinocularFrame], frame_words: str) -> Section:
+    """The poses of n frames over time. frame_words: in which frame they are, and which angles are meant."""
+    value, sigma = np.full((len(frames), 6), np.nan), np.full((len(frames), 6), np.nan)
+    for i, t in enumerate(frames):
+        if t.pose is not None and t.covariance is not None:
+            numbers = pose_numbers(t.pose, t.covariance)
+            value[i], sigma[i] = numbers[[0, 1, 2, 7, 8, 9]], numbers[10:]
     value[:, 3:] = unwrapped(value[:, 3:])
-    measured = np.array([r.measured for r in results.records])
-    axis, drawings = _axis(results), []
+    measured, drawings = np.array([t.status is PoseStatus.MEASURED for t in frames]), []
     for k in (0, 3, 1, 4, 2, 5):
         name, unit = (f"{_AXES[k]}", "m") if k < 3 else (("yaw", "pitch", "roll")[k - 3], "deg")
         shown = value[:, k]
         band = Band.about(shown, np.where(measured, sigma[:, k], np.nan), 3.0, BLUE, "3 sigma")
         line, y_range = Line(shown, BLUE, name), padded_range(shown)
         drawings.append(axis.panel(name, unit, line, bands=(band,), y_range=y_range, wide=False, height=118))
-    words = (
-        "Position of the body origin and attitude (Rz(yaw) Ry(pitch) Rx(roll)) in the frame of the pair, with 3 sigma."
-        " Shaded: not measured."
-    )
-    return Section("Pose", words, drawings)
+    return Section("Pose", f"{frame_words}, with 3 sigma. Shaded: not measured.", drawings)
 
 
 def _truth(results: StereoResults, e: TruthErrors) -> Section:

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import undistorted
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics import Intrinsics
 from geometry.arrays import Array
 from geometry.rotations import exp
 

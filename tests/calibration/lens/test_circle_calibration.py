@@ -14,8 +14,7 @@ from calibration.least_squares.adjustment import Vectors
 from calibration.lens.fit.corner_table import CircleAreas, CornerTable
 from calibration.lens.fit.lens_adjustment import with_circle_radius
 from calibration.lens.fit.lens_models import LensModel
-from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics import Intrinsics, IntrinsicsOptions, calibrate_intrinsics
 from lab.calibrate.camera.camera_page import findings_of
 from lab.findings.finding import Level
 from tests.calibration.lens.rendered_circles import LENS, CircleScene, outlines, projected, shots, table_of

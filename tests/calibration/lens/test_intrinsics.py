@@ -11,8 +11,7 @@ import pytest
 
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, named
-from calibration.lens.intrinsics import IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics import Intrinsics, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
 from geometry.camera import FISHEYE
 from lab.calibrate.camera.camera_page import findings_of
 from lab.findings.finding import Level, verdict

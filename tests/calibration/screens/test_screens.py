@@ -13,10 +13,17 @@ from calibration.screens import clouds
 from calibration.screens.clouds import register
 from calibration.screens.flatness import assess_flatness, fit_surface, frame_of_dots, frame_of_extent
 from calibration.screens.network_start import resect
-from calibration.screens.screens import ScreenSetup, facing, moved_to_surface, pose_covariance, screen_of_dots
+from calibration.screens.screens import (
+    ScreenSetup,
+    camera_sigmas,
+    facing,
+    moved_to_surface,
+    pose_covariance,
+    screen_of_dots,
+)
 from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
-from geometry.rotations import exp
+from geometry.rotations import exp, log
 from tests.calibration.screens.networks import lab, measured
 from tests.open3d_marker import needs_open3d
 
@@ -262,3 +269,17 @@ def test_invalid_targets_raise(spoil, words):
     n = len(spoilt)
     with pytest.raises(ValueError, match=words):
         register(names[:n], spoilt, world[:n], np.tile(np.eye(3) * 1e-6, (n, 1, 1)), 1e-3)
+
+
+def test_the_sigmas_of_a_camera_are_the_scatter_of_its_place_and_attitude_wherever_the_worlds_origin_is():
+    camera = next(iter(lab().cameras.values()))
+    rng = np.random.default_rng(28)
+    root = rng.normal(size=(6, 6)) * 1e-3
+    for shift in (np.zeros(3), np.array([20.0, -30.0, 5.0])):
+        moved = replace(camera, camera_from_world=camera.camera_from_world @ Pose(np.eye(3), -shift))
+        drawn = moved.camera_from_world.plus(rng.normal(size=(4000, 6)) @ root.T)
+        place, turn = camera_sigmas(moved, root @ root.T)
+        centre = moved.camera_from_world.inverse().translation
+        off, angle = drawn.inverse().translation - centre, moved.camera_from_world.inverse() @ drawn
+        assert place == pytest.approx(np.sqrt(np.mean(off**2)), rel=0.05)
+        assert turn == pytest.approx(np.sqrt(np.mean(log(angle.rotation) ** 2)), rel=0.05)

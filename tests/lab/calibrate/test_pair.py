@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 
 from calibration.lens.fit.lens_models import LensModel
-from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
-from calibration.lens.intrinsics_result import Intrinsics
+from calibration.lens.intrinsics import Intrinsics, IntrinsicsOptions, calibrate_intrinsics
 from calibration.pair import PairError, calibrate_pair
 from lab.calibrate.camera.pair import findings_of, next_pairs, range_sigmas
 from lab.findings.finding import Level, verdict

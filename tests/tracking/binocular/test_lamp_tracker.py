@@ -23,8 +23,7 @@ from studies.fu2016 import (
 from tracking.binocular.acquisition import observations
 from tracking.binocular.histories import _has_its_lights, _relative_motion
 from tracking.binocular.joint_fit import MarkerObservations
-from tracking.binocular.lamp_corners import harris_corners, harris_response
-from tracking.binocular.lamp_tracker import LampTracker
+from tracking.binocular.lamp_tracker import LampTracker, harris_corners, harris_response
 from tracking.binocular.marker_model import MarkerImages
 from tracking.statuses import Cause, PoseStatus
 
@@ -145,6 +144,11 @@ def test_the_relative_motion_of_lights_is_that_beyond_shift_turn_and_scale_in_th
     clear, hidden = (_relative_motion(MarkerObservations(uv, c), MarkerObservations(moved, c)) for c in (cov, vague))
     assert clear > 50
     assert hidden == pytest.approx(clear / 25)
+    rng, noisy = np.random.default_rng(4), []
+    for _ in range(600):
+        seen = MarkerObservations(turned + rng.normal(0.0, 0.1, uv.shape), cov)
+        noisy.append(_relative_motion(MarkerObservations(uv, cov), seen))
+    assert np.mean(noisy) == pytest.approx(1.0, abs=0.1)  # 600 x 4 squared normal numbers
 
 
 def test_a_pose_is_continued_by_its_own_lights_alone():

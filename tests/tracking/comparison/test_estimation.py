@@ -9,7 +9,13 @@ import pytest
 
 from geometry import rotations
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
-from tracking.comparison.estimation import Free, NotComparableError, estimate_alignment
+from tracking.comparison.estimation import (
+    Free,
+    NotComparableError,
+    estimate_alignment,
+    offset_candidates,
+    speeds_correlation,
+)
 from tracking.comparison.frame_alignment import (
     BODY,
     LEVER,
@@ -225,3 +231,17 @@ def test_plus_and_minus_are_inverse():
     delta = np.linspace(-0.3, 0.4, 14)
     np.testing.assert_allclose(minus(TRUTH.plus(delta), TRUTH), delta, atol=1e-12)
     assert TRANSLATION.stop == 14
+
+
+def test_candidates_of_the_offset_are_the_largest_maxima_down_to_half_of_the_largest():
+    """Of a reference whose rates are mostly noise: the largest correlation is then small itself."""
+    result, reference = recordings(2, reference_sigmas=(1e-4, 0.02))
+    offset, r = speeds_correlation(result, reference)
+    assert 0.1 < r.max() < 0.7
+    maxima = [
+        i for i in range(len(r)) if r[i] == r[max(i - 1, 0) : i + 2].max() and (i + 1 == len(r) or r[i] > r[i + 1])
+    ]
+    best = sorted(maxima, key=lambda i: -r[i])[:6]
+    expected = [offset[i] for i in best if r[i] >= 0.5 * r.max()]
+    assert len(expected) > 1
+    np.testing.assert_array_equal(offset_candidates(result, reference), expected)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tracking.noise_estimation.averaging import OPEN_SHUTTER, kept_of_the_last, stretch_by_motion
+from tracking.noise_estimation.averaging import OPEN_SHUTTER, RowCounts, kept_of_the_last, stretch_by_motion
 
 
 def seen(rng: np.random.Generator, growth: float, frames: int = 60) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -30,7 +30,7 @@ def test_the_growth_is_found_to_its_sigma(growth):
     rng = np.random.default_rng(8)
     found = np.array([stretch_by_motion(*seen(rng, growth)) for _ in range(60)])
     off = (found[:, 0] - growth) / found[:, 1]
-    assert np.sqrt(np.mean(off**2)) < 1.3
+    assert 0.7 < np.sqrt(np.mean(off**2)) < 1.3
     assert np.abs(off).max() < 4.0
     assert np.median(found[:, 1]) < 0.05  # a fifth of the picture before is 0.31
 
@@ -64,3 +64,41 @@ def test_pictures_that_say_nothing_about_averages_are_none():
     blocks = np.repeat(np.rint(noise[:1] + 50), 3, axis=0)  # a compressed video at rest
     for pictures in (blocks, np.rint(noise + 50)[:2], np.rint(50 + 0.1 * noise), np.rint(noise + 50)[:, :9, :9]):
         assert np.isnan(kept_of_the_last(list(pictures.astype(np.uint8)), 1 / 12))
+
+
+def bars(seed: int, second_rows: slice, height: int = 120, width: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Two noisy pictures of a bar, 30 DN bright, that has moved by its width in these rows of the second one."""
+    first = np.full((120, 160), 60.0)
+    first[:height, 40 : 40 + width] += 30.0
+    second = first.copy()
+    second[:height][second_rows] = np.roll(first[:height][second_rows], width, axis=1)
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, (2, *first.shape))
+    return tuple(np.rint(p).astype(np.uint8) for p in np.add(noise, (first, second)))
+
+
+def counted(*pictures: tuple[np.ndarray, np.ndarray]) -> RowCounts:
+    counts = RowCounts()
+    for first, second in pictures:
+        counts.add(first, second)
+    return counts
+
+
+def test_rows_of_two_instants_alternate_where_something_moves():
+    """An edge of 7 sigmas of the noise is enough; the sum over pictures counts."""
+    assert counted(bars(1, np.s_[::2])).interlaced
+    assert not counted(bars(1, np.s_[:])).interlaced  # progressive
+    few = bars(2, np.s_[::2], height=10, width=1)
+    assert not counted(few).interlaced
+    assert counted(*[few] * 8).interlaced
+    assert not counted((few[0], few[1][:, :80])).interlaced  # of another size
+
+
+def test_texture_that_appears_and_blocks_of_a_video_do_not_alternate_as_interlaced_rows_do():
+    first, part = np.full((120, 160), 60, np.uint8), np.s_[:, 40:60]
+    board, stripes = first.copy(), first.copy()
+    board[part] += (40 * (np.indices(board[part].shape).sum(axis=0) % 2)).astype(np.uint8)  # in columns as well
+    assert not counted((first, board)).interlaced
+    for row in (0, 2, 11, 13):  # rows that alternate four times in turn, and no more
+        stripes[row:100:22, 40:60] += 40
+    stripes[[106, 108, 110], 40:60] += 40  # in one place six times
+    assert not counted((first, stripes)).interlaced

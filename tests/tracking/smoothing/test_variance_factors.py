@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tracking.smoothing.error_scale import Squares, likely_factors
 from tracking.smoothing.place_errors import PLACE_FACTOR
-from tracking.smoothing.variance_factors import Squares, likely_factors
 
 
 def squares(ratio: np.ndarray, place: np.ndarray, weight: float = 1.0, least: np.ndarray | float = 0.0) -> Squares:

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, true_ranges
 from tracking.rigid_body.online_estimates import MANOEUVRE_S
 from tracking.smoothing.motion.clocks import solve_clocks
 from tracking.smoothing.motion.fixed_interval import Interval, RunInformation, smoothed
@@ -329,13 +329,13 @@ class _TimedEstimator(_Estimator):
 
     def _gaps_opened(self) -> None:
         """Replace turns in and beside gaps: nothing shows in which of the unobserved steps the velocities jump."""
-        ends = np.flatnonzero(np.diff(np.r_[False, self.unobserved, False]))
+        gaps = true_ranges(self.unobserved)
         for turn in list(self.turns):
             inside = (self.t_s > turn.begin_s) & (self.t_s - self.dt < turn.end_s)
             if not (inside & self.unobserved).any():
                 continue
             self.turns.remove(turn)
-            for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+            for first, end in gaps:
                 if inside[first:end].any():
                     inside[first:end] = True
             frames = self.dt[inside].sum() / self.frame_s
@@ -392,8 +392,8 @@ class _TimedEstimator(_Estimator):
 
     def _allowed_at_ends(self) -> Array:
         """(F,): `allowed`, also of the ends of each gap."""
-        out, ends = self.allowed.copy(), np.flatnonzero(np.diff(np.r_[False, self.vague, False]))
-        for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+        out = self.allowed.copy()
+        for first, end in true_ranges(self.vague):
             out[first:end] = out[first:end].max()
         return out
 
@@ -406,8 +406,7 @@ class _TimedEstimator(_Estimator):
     def _hidden_excluded(self) -> bool:
         """Exclude jumps from gaps where the motion around is more likely without; whether from any more."""
         search, before, every = self._search(), self.steady.copy(), self._hidden(np.ones(len(self.t_s)))
-        ends = np.flatnonzero(np.diff(np.r_[False, every.any(axis=1), False]))
-        for first, end in zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True):
+        for first, end in true_ranges(np.asarray(every.any(axis=1))):
             steady, allowed = search.gap_share(slice(first, end), every, self.turns)
             self.steady[first:end] |= steady
             self.allowed[first:end] = np.maximum(self.allowed[first:end], allowed)

@@ -13,6 +13,12 @@ from click.testing import CliRunner
 from bench.related_measurements.lamps import judged, write_recording
 from bench.related_measurements.renderers.second_renderer import background
 from cli import main
+from geometry.pose import Pose
+from lab.report.page import PageDrawing
+from lab.report.plot.series import Band
+from lab.targets.stereo.page import pose_section
+from tracking.binocular.pose_tracker import BinocularFrame
+from tracking.statuses import PoseStatus
 
 
 @pytest.fixture(scope="module")
@@ -132,3 +138,31 @@ def test_a_failed_calibration_is_not_used(recording):
     content = yaml.safe_load((folder / "camera.yaml").read_text())
     (folder / "failed.yaml").write_text(yaml.safe_dump({**content, "calibration": {"verdict": "FAIL"}}))
     assert typed(folder, camera="failed.yaml").exit_code == 3
+
+
+class Panels:
+    """A time axis that keeps what is drawn."""
+
+    def __init__(self) -> None:
+        self.drawn: dict[str, tuple[np.ndarray, Band]] = {}
+
+    def panel(self, name, unit, line, *, bands, **_):
+        self.drawn[name] = line.y, bands[0]
+        return PageDrawing("")
+
+
+def test_a_target_that_turns_beyond_180_deg_is_drawn_without_a_jump():
+    yaw = np.array([170.0, 175.0, 180.0, 185.0, 190.0])
+    poses = [Pose.from_ypr(np.deg2rad([angle, 0.0, 0.0]), np.array([0.0, 0.0, 20.0])) for angle in yaw]
+    statuses = [PoseStatus.MEASURED] * 3 + [PoseStatus.PREDICTED, PoseStatus.MEASURED]
+    none = np.full((2, 1), -1)
+    frames = [
+        BinocularFrame(status, "", pose, 1e-6 * np.eye(6), None, None, none, np.full((2, 1, 2), np.nan))
+        for status, pose in zip(statuses, poses, strict=True)
+    ]
+    axis = Panels()
+    pose_section(axis, frames, "Pose")
+    shown, band = axis.drawn["yaw"]
+    np.testing.assert_allclose(np.diff(shown), 5.0, atol=1e-9)
+    np.testing.assert_array_equal(np.isfinite(band.high), [True, True, True, False, True])
+    assert list(axis.drawn) == ["x", "yaw", "y", "pitch", "z", "roll"]
