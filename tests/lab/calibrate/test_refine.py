@@ -333,6 +333,14 @@ def test_a_rig_of_which_nothing_is_stated_is_refused_and_the_option_is_named(lab
     assert "--sigma cameras.position_m=0.005" in done.output
 
 
+def test_a_run_of_another_rig_is_refused_with_the_name_of_the_rig_that_was_given(lab, tmp_path):
+    folder, runs, _, _ = lab
+    other = recordings(tmp_path, "clean", count=1, frames=5)[0]
+    done = typed("refine", runs[0], other, "--rig", folder / "rig.yaml", "--out", tmp_path / "new")
+    expected = f"{other / 'run.yaml'}: cameras.left: expected a camera of {folder / 'rig.yaml'}, got 'left'"
+    assert (done.exit_code, expected in done.output) == (2, True), done.output
+
+
 def test_a_run_that_is_named_twice_is_refused(lab, tmp_path):
     folder, runs, _, _ = lab
     done = typed("refine", runs[0], runs[0], "--rig", folder / "rig.yaml", "--out", tmp_path / "new")
