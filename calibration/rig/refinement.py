@@ -359,7 +359,8 @@ def refine(
     stated = [r for r in (_usable(model, r) for r in recordings) if len(r.seen) >= fewest]
     if not stated:
         raise AdjustmentError(
-            f"no recording has {fewest} frames with {FEWEST_SPOTS} and more spots that determine a pose"
+            f"no recording has {fewest} frames with {FEWEST_SPOTS} and more spots that determine a pose; with more"
+            " spots in the pictures, smaller sigmas of the rig or a narrower first pose more points can get a label"
         )
     noise, excluded = np.ones(len(rig.cameras)), 0
     limits = Limits() if start is None else _NEAR

@@ -129,8 +129,8 @@ def _clocks_in_use(run: Run) -> Array:
     return np.array([(c.offset_s, c.row_time_s) for c in clocks])
 
 
-def tolerant(run: Run) -> Run:
-    """The run with a tracker that expects the residuals that the errors of its rig cause."""
+def tolerant(run: Run, times: float = 1.0) -> Run:
+    """The run with a tracker that expects the residuals that the errors of its rig cause. times: so many of them."""
     model = SpotModel.of(run.rig)
     if run.covariance is None:
         return run
@@ -143,7 +143,7 @@ def tolerant(run: Run) -> Run:
     J, C = J[seen], C[np.ix_(seen, seen)]
     left = np.eye(len(J)) - J @ np.linalg.pinv(J)
     # Where the pose absorbs all errors, the rest is rounding, of either sign.
-    px = _EXPECTED * float(np.sqrt(max(np.trace(left @ C @ left), 0.0) / max(np.trace(left), 1.0)))
+    px = times * _EXPECTED * float(np.sqrt(max(np.trace(left @ C @ left), 0.0) / max(np.trace(left), 1.0)))
     return replace(run, tracker=replace(run.tracker, sigma_model_px=max(px, run.tracker.sigma_model_px)))
 
 

@@ -65,6 +65,9 @@ _STEP = Step("refinement by recordings", (RESIDUALS,), RIG)
 # Frames of each run for the first solutions, at most and with a pose: each solution only has to be good enough to label
 # the frames of the next. While the rig is off by 10 px, half of the spots get no label and a frame takes 0.1 s.
 _FIRST_FRAMES = ((40, 20), (100, 50))
+# Times the usual residuals that the tracker expects after a run with too few labels: a pose that fits the spots of one
+# camera leaves those of the others farther off than one that fits all. After ten times as much it labels nothing.
+_WIDER = 3.0
 _STACKS_OF = {
     CAMERAS: (CAMERAS,), SCREENS: (SCREENS, BOWS), BEAMS: (BEAMS,),
     LENS: (INTRINSICS,), CLOCKS: (OFFSETS,), SHUTTER: (ROW_TIMES,),
@@ -186,18 +189,19 @@ def _refined(
         return found
 
     try:
-        now = rig, prior
+        now, times = (rig, prior), 1.0
         latest: dict[int, ModelCheckRecording] = {}  # of each run
         for stage, i in product(range(len(_FIRST_FRAMES)), range(len(runs))):
             # Each run is labelled with what those before it have shown.
-            latest[i] = of_stage(tolerant(with_rig(runs[i], *now)), i, stage).in_views_of(rig)
+            latest[i] = of_stage(tolerant(with_rig(runs[i], *now), times), i, stage).in_views_of(rig)
             try:
                 start = refine(rig, prior, list(latest.values()), stacks=stacks, for_labels=True)
             except AdjustmentError:
                 if stage > 0 and i == len(runs) - 1:
                     raise
-                continue  # the first few frames have too few labels
-            now = start.rig, start.covariance
+                times = _WIDER if times == 1.0 else 1.0  # the first few frames have too few labels
+                continue
+            now, times = (start.rig, start.covariance), 1.0
         second = [of_stage(with_rig(run, *now), i, len(_FIRST_FRAMES)) for i, run in enumerate(runs)]
         model = SpotModel.of(start.rig)
         recordings = [with_place_errors(r.in_views_of(rig), model) for r in second]

@@ -137,7 +137,7 @@ def load_run(run_folder: Path, rig_path: Path | None = None, recording: bool = F
     content = fields.validated(_RunBlock, read_mapping(path), path)
     tracker = dataclass_from_yaml(TrackerParameters, content.tracker, path, "tracker")
 
-    rig_path = folder / content.rig if rig_path is None else rig_path
+    named, rig_path = (content.rig, folder / content.rig) if rig_path is None else (rig_path, rig_path)
     if not rig_path.is_file():
         raise InputError(
             f"{path}: rig: expected a rig file, found none at {rig_path}; paths start at run.yaml's folder"
@@ -145,7 +145,7 @@ def load_run(run_folder: Path, rig_path: Path | None = None, recording: bool = F
     rig_file = load_rig_file(rig_path)
     rig = rig_file.rig
     mistakes = [
-        f"{path}: cameras.{name}: expected a camera of {rig_path.name}, got {name!r}{suggest_name(name, rig.cameras)}"
+        f"{path}: cameras.{name}: expected a camera of {named}, got {name!r}{suggest_name(name, rig.cameras)}"
         for name in content.cameras
         if name not in rig.cameras
     ]

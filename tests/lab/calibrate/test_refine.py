@@ -7,6 +7,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from cli import main
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import covariance_root, perturbed_rig
+from lab.calibrate.refine import refine as refinement
 from lab.calibrate.refine.recordings import labelled, stated_covariance, tolerant, with_rig
 from lab.calibrate.refine.refine import refine_findings, refine_rig
 from lab.errors import CalibrationError
@@ -215,6 +217,30 @@ def test_a_camera_whose_points_may_be_its_spots_is_left_out_and_the_recording_us
     assert np.isfinite(found.recording.poses.translation[:, 0]).sum() > 10
 
 
+def test_after_a_recording_with_too_few_labels_the_tracker_expects_larger_residuals_in_the_next(
+    lab, tmp_path, monkeypatch
+):
+    folder, runs, _, _ = lab
+    expected = []
+
+    def few_labels(run, *_, **__):
+        expected.append((run.folder, run.tracker.sigma_model_px))
+        return SimpleNamespace(searched=True, in_views_of=lambda _: None)
+
+    def too_few(*_, **__):
+        raise AdjustmentError("no recording has 10 frames")
+
+    monkeypatch.setattr(refinement, "labelled", few_labels)
+    monkeypatch.setattr(refinement, "refine", too_few)
+    with pytest.raises(CalibrationError, match="cannot be refined by these recordings: no recording has 10 frames"):
+        refine_rig(runs, folder / "rig.yaml", tmp_path / "new")
+    known = load_rig_file(folder / "rig.yaml")
+    prior = joint_covariance(known.rig, known.covariances, folder / "rig.yaml")
+    usual = [tolerant(with_rig(load_run(run), known.rig, prior)).tracker.sigma_model_px for run in runs]
+    times = [px / usual[runs.index(run)] for run, px in expected]
+    np.testing.assert_allclose(times, [1, 3, 1, 3], rtol=1e-9)
+
+
 def test_a_recording_of_which_no_frame_has_a_pose_contradicts_the_rig(lab):
     result = lab[3].result
     first = result.runs[0].recording
@@ -305,6 +331,14 @@ def test_a_rig_of_which_nothing_is_stated_is_refused_and_the_option_is_named(lab
     done = typed("refine", runs[0], "--rig", tmp_path / "rig.yaml", "--out", tmp_path / "new")
     assert done.exit_code == 2
     assert "--sigma cameras.position_m=0.005" in done.output
+
+
+def test_a_run_of_another_rig_is_refused_with_the_name_of_the_rig_that_was_given(lab, tmp_path):
+    folder, runs, _, _ = lab
+    other = recordings(tmp_path, "clean", count=1, frames=5)[0]
+    done = typed("refine", runs[0], other, "--rig", folder / "rig.yaml", "--out", tmp_path / "new")
+    expected = f"{other / 'run.yaml'}: cameras.left: expected a camera of {folder / 'rig.yaml'}, got 'left'"
+    assert (done.exit_code, expected in done.output) == (2, True), done.output
 
 
 def test_a_run_that_is_named_twice_is_refused(lab, tmp_path):
