@@ -15,6 +15,7 @@ Stacks on which it depends:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from calibration.terms.surveyed import array_of, pose_of
 from geometry import lens
 from geometry.arrays import Array, Bools, Ints
 
+_tilt = lru_cache(lens.tilt_with_derivatives)  # nearly all lenses have none
 INTRINSICS_COUNT = 18  # numbers of a camera: fx, fy, cx, cy and OpenCV's fourteen distortion coefficients
 _BY_BOARD = ("warp", "radius", "stretch")  # stacks with one unknown per board
 
@@ -121,7 +123,7 @@ class CornerTerm:
             points,
             self.from_middle,
             lenses,
-            lens.tilt_with_derivatives(lenses[:, 16], lenses[:, 17]),
+            np.stack([_tilt(*numbers[16:]) for numbers in lenses]),
             self.fisheye,
             cameras,
             placements,

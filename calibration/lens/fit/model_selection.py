@@ -118,7 +118,7 @@ def _futile(table: CornerTable, model: LensModel, smaller: Sequence[_Judged]) ->
     if model.coefficients < RATIONAL.coefficients:
         return ""
     fits = [j.candidate.fit for j in smaller if j.candidate.fit is not None and not j.scatters]
-    if any(beyond_noise(*cell_means(table, f), f.sigma_px)[0] >= PLAUSIBLE_NOISE for f in fits):
+    if any(_leaves_noise(table, f) for f in fits):
         return "a smaller model leaves no correlated residuals and no scatter between photographs"
     unknown = (j.unknown_px * max(1.0, j.scatter) for j in smaller if j.map and j.candidate.model == RATIONAL)
     if any(px > UNKNOWN_PX for px in unknown):
@@ -126,11 +126,21 @@ def _futile(table: CornerTable, model: LensModel, smaller: Sequence[_Judged]) ->
     return ""
 
 
+def _leaves_noise(table: CornerTable, found: LensFit) -> bool:
+    """Whether the residuals of a fit look like noise."""
+    return beyond_noise(*cell_means(table, found), found.sigma_px)[0] >= PLAUSIBLE_NOISE
+
+
 def _best_start(
     table: CornerTable, used: Bools, model: LensModel, starts: Sequence[Values | None], board: BoardFreedom
 ) -> ModelCandidate:
-    """The best fit of the model over the start values."""
-    candidates = [_fitted(table, used, model, start, board) for start in starts]
+    """The best fit of the model over the start values, up to the first that leaves only noise."""
+    candidates: list[ModelCandidate] = []
+    for start in starts:
+        candidates.append(_fitted(table, used, model, start, board))
+        found = candidates[-1].fit
+        if found is not None and len(starts) > 1 and _leaves_noise(table, found):
+            break
     return min(candidates, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
 
 
