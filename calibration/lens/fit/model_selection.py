@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.least_squares.adjustment import AdjustmentError, Values, Vectors
+from calibration.least_squares.adjustment import AdjustmentError, Limits, Values, Vectors
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
-from calibration.lens.fit.lens_adjustment import BRIEF
+from calibration.lens.fit.lens_adjustment import BRIEF, ROUGH
 from calibration.lens.fit.lens_fit import CORNER_GATE, LensFit, fit, robust_fit
 from calibration.lens.fit.lens_models import (
     LENS_MODELS,
@@ -306,8 +306,9 @@ def inliers_of_rich_models(
     """
     fits: list[LensFit] = []
     reasons: list[str] = []
-    for model, values in starts:
-        fits += _rich_fit(table, model, values, reasons)
+    for search in (BRIEF, ROUGH):
+        for model, values in () if fits else starts:
+            fits += _rich_fit(table, model, values, reasons, search)
     leaves = [
         beyond_noise(*cell_means(table, f), f.sigma_px)[0] < SIGNIFICANT or f.used.mean() < FEWEST_INLIERS for f in fits
     ]
@@ -315,7 +316,7 @@ def inliers_of_rich_models(
     tried = any(model == RATIONAL for model, _ in starts)
     if not tried and (wanted or (only is None and all(leaves))):
         for values in [as_rational(table, f) for f in fits]:
-            fits += _rich_fit(table, RATIONAL, values, reasons)
+            fits += _rich_fit(table, RATIONAL, values, reasons, BRIEF)
     if not fits:
         raise AdjustmentError(reasons[-1])
     gate = CORNER_GATE * min(f.sigma_px for f in fits)
@@ -326,11 +327,13 @@ def inliers_of_rich_models(
     return used, fits
 
 
-def _rich_fit(table: CornerTable, model: LensModel, values: Values, reasons: list[str]) -> list[LensFit]:
+def _rich_fit(
+    table: CornerTable, model: LensModel, values: Values, reasons: list[str], search: Limits
+) -> list[LensFit]:
     """The robust fit with the bend of the board free if it can be solved for; empty if not even the lens can."""
     for board in (BoardFreedom(warp=True), AS_STATED):
         try:
-            return [robust_fit(table, model, values, board, BRIEF)]
+            return [robust_fit(table, model, values, board, BRIEF, search)]
         except AdjustmentError as error:
             reasons.append(str(error))
     return []
