@@ -170,13 +170,7 @@ def project_points_full(
 ) -> Projected:
     """As `project_points`, with the derivatives with respect to the camera's numbers too: for calibrations."""
     pixels, d_point, xy, distorted = _projected(points_camera, pinhole, distortion, fold_r2, fisheye)
-    if not np.any(fisheye):
-        d_coefficients = lens.coefficient_jacobian(xy, distortion, distorted)
-    else:
-        d_coefficients = lens.fisheye_coefficient_jacobian(xy, distortion)
-        if not np.all(fisheye):
-            wide = np.asarray(fisheye)[..., None, None]
-            d_coefficients = np.where(wide, d_coefficients, lens.coefficient_jacobian(xy, distortion))
+    d_coefficients = lens.coefficient_jacobian(xy, distortion, fisheye)
     d_pinhole = np.zeros((*pixels.shape, 4))
     d_pinhole[..., 0, 0], d_pinhole[..., 1, 1] = distorted[..., 0], distorted[..., 1]
     d_pinhole[..., 0, 2] = d_pinhole[..., 1, 3] = 1.0

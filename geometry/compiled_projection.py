@@ -2,8 +2,7 @@
 
 The forward model is geometry/forward_model.py; start there. Its `SpotModel.project` and `SpotModel.derivatives` call
 `project_all`, `derivatives_all` and `lit_points`, and the trackers' compiled loops call `project_view`. The lenses
-stand a second time in lens.py, with derivatives by their numbers. tests/geometry/test_forward_model.py compares with a
-computation by other means.
+are called by lens.py as well. tests/geometry/test_forward_model.py compares with a computation by other means.
 """
 
 from __future__ import annotations
@@ -382,9 +381,54 @@ def distort_all(xy: Array, k: Array, fisheye: Bools) -> tuple[Array, Array]:
     out, J = np.empty_like(xy), np.empty((len(xy), 2, 2))
     for i in range(len(xy)):
         own, wide = k[i if len(k) > 1 else 0], fisheye[i if len(fisheye) > 1 else 0]
-        point = _fisheye(own, xy[i, 0], xy[i, 1]) if wide else _polynomial(own, xy[i, 0], xy[i, 1])
+        point = distorted_point(own, wide, xy[i, 0], xy[i, 1])
         out[i, 0], out[i, 1], J[i, 0, 0], J[i, 0, 1], J[i, 1, 0], J[i, 1, 1] = point
     return out, J
+
+
+@compiled
+def distorted_point(k: Array, fisheye: bool, x: float, y: float) -> tuple[float, float, float, float, float, float]:
+    """One point of `distort_all`, and the entries xx, xy, yx, yy of its Jacobian; k (14,)."""
+    return _fisheye(k, x, y) if fisheye else _polynomial(k, x, y)
+
+
+@compiled
+def by_coefficients_all(xy: Array, k: Array, fisheye: Bools) -> Array:
+    """Derivatives (n, 2, 14) of distorted points by all coefficients k, of a sensor without tilt; as `distort_all`."""
+    J = np.zeros((len(xy), 2, 14))
+    for i in range(len(xy)):
+        own, wide = k[i if len(k) > 1 else 0], fisheye[i if len(fisheye) > 1 else 0]
+        by_coefficients(own, wide, xy[i, 0], xy[i, 1], J[i])
+    return J
+
+
+@compiled
+def by_coefficients(k: Array, fisheye: bool, x: float, y: float, J: Array) -> None:
+    """Writes the derivatives of one point of `by_coefficients_all` to J (2, 14), which is 0 where a lens has none."""
+    r2 = x * x + y * y
+    if fisheye:
+        r = np.sqrt(r2)
+        angle = np.arctan(r)
+        scale = angle * angle * angle / (r if r > 1e-8 else 1.0)
+        for column in range(4):
+            J[0, column], J[1, column] = x * scale, y * scale
+            scale *= angle * angle
+        return
+    r4, r6 = r2 * r2, r2 * r2 * r2
+    denominator = 1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+    radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / denominator
+    for column, power in ((0, r2), (1, r4), (4, r6)):
+        J[0, column], J[1, column] = x * power / denominator, y * power / denominator
+    for column, power in ((5, r2), (6, r4), (7, r6)):
+        change = -radial * power / denominator
+        J[0, column], J[1, column] = x * change, y * change
+    J[0, 2], J[1, 2] = 2 * x * y, r2 + 2 * y * y
+    J[0, 3], J[1, 3] = r2 + 2 * x * x, 2 * x * y
+    J[0, 8], J[0, 9] = r2, r4
+    J[1, 10], J[1, 11] = r2, r4
+    bx, by = _polynomial(k, x, y)[:2]
+    J[0, 12], J[1, 12] = bx * by, by * by
+    J[0, 13], J[1, 13] = -bx * bx, -bx * by
 
 
 @compiled

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.polynomial import polynomial as poly
 
 from geometry.arrays import Array, Bools
-from geometry.compiled_projection import VIEW, distort_all, lens_codes, undistort_all
+from geometry.compiled_projection import VIEW, by_coefficients_all, distort_all, lens_codes, undistort_all
 
 N_DISTORTION = 14
 ALLOWED_LENGTHS = (0, 4, 5, 8, 12, 14)
@@ -33,6 +33,17 @@ def distort(xy: Array, coefficients: Array, fisheye: Bools | bool = False) -> tu
     fisheye (...): whether they are the fisheye model's, k1, k2, k3, k4 and zeros. Its radius of an angle t off the axis
     is t (1 + k1 t^2 + k2 t^4 + ...). Source: OpenCV, calib3d, "Fisheye camera model".
     """
+    stack, wide, numbers = _for_compiled(xy, coefficients, fisheye)
+    rows, J_rows = distort_all(*numbers)
+    out, J = rows.reshape(*stack, 2), J_rows.reshape(*stack, 2, 2)
+    tau_x, tau_y = np.where(wide, 0.0, coefficients[..., 12]), np.where(wide, 0.0, coefficients[..., 13])
+    return _tilt(out, J, tau_x, tau_y) if np.any(tau_x) or np.any(tau_y) else (out, J)
+
+
+def _for_compiled(
+    xy: Array, coefficients: Array, fisheye: Bools | bool
+) -> tuple[tuple[int, ...], Bools, tuple[Array, Array, Bools]]:
+    """The points' leading axes, which are fisheye lenses, and the arguments of `distort_all`."""
     wide = np.asarray(fisheye, dtype=bool)
     stack = np.broadcast_shapes(xy.shape[:-1], coefficients.shape[:-1], wide.shape)
     k = coefficients if coefficients.ndim == 1 else np.broadcast_to(coefficients, (*stack, N_DISTORTION))
@@ -40,10 +51,7 @@ def distort(xy: Array, coefficients: Array, fisheye: Bools | bool = False) -> tu
     # Copies, because read-only arrays have another type for numba, which would compile a second time for them.
     points = np.array(np.broadcast_to(xy, (*stack, 2)), dtype=np.float64, order="C").reshape(-1, 2)
     k = np.array(k, dtype=np.float64, order="C").reshape(-1, N_DISTORTION)
-    rows, J_rows = distort_all(points, k, np.array(wide, order="C").reshape(-1))
-    out, J = rows.reshape(*stack, 2), J_rows.reshape(*stack, 2, 2)
-    tau_x, tau_y = np.where(wide, 0.0, coefficients[..., 12]), np.where(wide, 0.0, coefficients[..., 13])
-    return _tilt(out, J, tau_x, tau_y) if np.any(tau_x) or np.any(tau_y) else (out, J)
+    return stack, wide, (points, k, np.array(wide, order="C").reshape(-1))
 
 
 def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
@@ -55,43 +63,23 @@ def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array
     return out, D @ J
 
 
-def coefficient_jacobian(xy: Array, coefficients: Array, distorted: Array | None = None) -> Array:
-    """d(distorted)/d(coefficients) (..., 2, 14) of `distort` by the perspective model.
-
-    xy (..., 2) and coefficients (..., 14) as there.
-    distorted (..., 2): the result of `distort`, if it is known.
-    """
-    k1, k2, _, _, k3, k4, k5, k6, *_, tau_x, tau_y = np.moveaxis(coefficients, -1, 0)
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    r4, r6 = r2 * r2, r2 * r2 * r2
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / denominator
-    J = np.zeros((*np.broadcast_shapes(xy.shape[:-1], np.shape(k1)), 2, N_DISTORTION))
-    for column, power in ((0, r2), (1, r4), (4, r6)):
-        J[..., 0, column], J[..., 1, column] = x * power / denominator, y * power / denominator
-    for column, power in ((5, r2), (6, r4), (7, r6)):
-        change = -radial * power / denominator
-        J[..., 0, column], J[..., 1, column] = x * change, y * change
-    J[..., 0, 2], J[..., 1, 2] = 2 * x * y, r2 + 2 * y * y
-    J[..., 0, 3], J[..., 1, 3] = r2 + 2 * x * x, 2 * x * y
-    J[..., 0, 8], J[..., 0, 9] = r2, r4
-    J[..., 1, 10], J[..., 1, 11] = r2, r4
+def coefficient_jacobian(xy: Array, coefficients: Array, fisheye: Bools | bool = False) -> Array:
+    """d(distorted)/d(coefficients) (..., 2, 14) of `distort`; arguments as there."""
+    stack, wide, numbers = _for_compiled(xy, coefficients, fisheye)
+    J = by_coefficients_all(*numbers).reshape(*stack, 2, N_DISTORTION)
+    tau_x, tau_y = np.where(wide, 0.0, coefficients[..., 12]), np.where(wide, 0.0, coefficients[..., 13])
     if not (np.any(tau_x) or np.any(tau_y)):
-        bent = distort(xy, coefficients)[0] if distorted is None else distorted
-        J[..., 12], J[..., 13] = bent * bent[..., 1:], -bent * bent[..., :1]
         return J
-    T, dT = tilt_matrix(np.asarray(tau_x), np.asarray(tau_y)), _tilt_derivatives(np.asarray(tau_x), np.asarray(tau_y))
-    untilted = np.array(coefficients, dtype=float)
-    untilted[..., 12:] = 0
-    bent, _ = distort(xy, untilted)
+    T, *dT = np.moveaxis(tilt_with_derivatives(tau_x, tau_y), -3, 0)
+    bent = distort_all(*numbers)[0].reshape(*stack, 2)
     h = _turned(T, bent)
     out = h[..., :2] / h[..., 2:]
     D = (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
     J[..., :12] = D @ J[..., :12]
     for column in (0, 1):
         dh = _turned(dT[column], bent)
-        J[..., 12 + column] = (dh[..., :2] - out * dh[..., 2:]) / h[..., 2:]
+        by_tilt = (dh[..., :2] - out * dh[..., 2:]) / h[..., 2:]
+        J[..., 12 + column] = np.where(wide[..., None], 0.0, by_tilt)
     return J
 
 
@@ -100,8 +88,8 @@ def _turned(T: Array, xy: Array) -> Array:
     return np.asarray(T[..., 0] * xy[..., :1] + T[..., 1] * xy[..., 1:] + T[..., 2])
 
 
-def _tilt_derivatives(tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
-    """d(tilt_matrix)/d(tau_x) and d(tilt_matrix)/d(tau_y), each (..., 3, 3): the product rule on T = along(R) R.
+def tilt_with_derivatives(tau_x: Array, tau_y: Array) -> Array:
+    """The tilt homography, d(T)/d(tau_x) and d(T)/d(tau_y) (..., 3, 3, 3): the product rule on T = along(R) R.
 
     Constant entries of the factors cancel in the differences.
     """
@@ -110,10 +98,12 @@ def _tilt_derivatives(tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
     by_x = _tilt_rotation(-sx, cx, cy, sy) - _tilt_rotation(0 * cx, 0 * sx, cy, sy)
     by_y = _tilt_rotation(cx, sx, -sy, cy) - _tilt_rotation(cx, sx, 0 * cy, 0 * sy)
     along = _along_axis(R)
-    return (
+    parts = [
+        along @ R,
         (_along_axis(by_x) - _along_axis(0 * by_x)) @ R + along @ by_x,
         (_along_axis(by_y) - _along_axis(0 * by_y)) @ R + along @ by_y,
-    )
+    ]
+    return np.stack(parts, axis=-3)
 
 
 def _tilt_rotation(cx: Array, sx: Array, cy: Array, sy: Array) -> Array:
@@ -193,17 +183,6 @@ def is_one_to_one(xy: Array, jacobian: Array, fold_r2: Array) -> Bools:
     r2 = np.sum(xy * xy, axis=-1)
     det = jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
     return (r2 < fold_r2) & (det > 0)
-
-
-def fisheye_coefficient_jacobian(xy: Array, coefficients: Array) -> Array:
-    """d(distorted)/d(coefficients) (..., 2, 14) of `distort` by the fisheye model."""
-    r = np.linalg.norm(xy, axis=-1)
-    t = np.arctan(r)
-    unit = xy / np.where(r > 1e-8, r, 1.0)[..., None]
-    J = np.zeros((*np.broadcast_shapes(xy.shape[:-1], np.shape(coefficients)[:-1]), 2, N_DISTORTION))
-    for column, power in enumerate((3, 5, 7, 9)):
-        J[..., column] = unit * (t**power)[..., None]
-    return J
 
 
 @lru_cache(maxsize=256)

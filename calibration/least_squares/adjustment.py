@@ -252,6 +252,7 @@ class Limits:
     steps: int = 60  # largest number of steps
     small_step_sigmas: float = 1e-3  # converged if a step is shorter than this, in sigmas of all unknowns together
     damping: float = 1e-4  # of the first step, relative to the diagonal of the normal matrix
+    must_converge: bool = True  # False: the values after the largest number of steps will do
 
 
 class AdjustmentError(ValueError):
@@ -380,7 +381,8 @@ def solve(
         if size < limits.small_step_sigmas:
             break
     else:
-        raise AdjustmentError(f"no convergence after {limits.steps} steps: the last one was {size:.2g} sigmas long")
+        if limits.must_converge:
+            raise AdjustmentError(f"no convergence after {limits.steps} steps: the last one was {size:.2g} sigmas long")
     H, _ = _normal_equations(terms, lines, columns)
     weights = tuple(_weights(t, line) for t, line in zip(terms, lines, strict=True))
     chi2 = sum(float(np.sum(w[:, None] * line.residuals**2)) for w, line in zip(weights, lines, strict=True))

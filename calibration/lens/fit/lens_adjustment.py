@@ -30,6 +30,9 @@ CONVERGED = Limits()
 # For fits that serve a decision or a start: a twentieth of a sigma is negligible against what they decide. Along the
 # valley of parameters that the views hardly determine, the iteration needs very many steps to a thousandth of a sigma.
 BRIEF = Limits(steps=40, small_step_sigmas=0.05)
+# For outliers where nothing else converges: if photographs contradict each other, steps of reweighting become shorter
+# by a few percent each. What is left out is decided by fits without them.
+ROUGH = replace(BRIEF, must_converge=False)
 # Relative sigma of a radius from the areas of blobs: blur and soft edges change it by .1 to .3 %, equally in all views.
 _RADIUS_SIGMA = 0.005
 _STATED_RADIUS_SIGMA = 0.02  # relative, of a stated radius: ink spreads and bright areas bloom

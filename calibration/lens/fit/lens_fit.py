@@ -112,12 +112,18 @@ def fit(
 
 
 def robust_fit(
-    table: CornerTable, model: LensModel, values: Values, board: BoardFreedom, limits: Limits = CONVERGED
+    table: CornerTable,
+    model: LensModel,
+    values: Values,
+    board: BoardFreedom,
+    limits: Limits = CONVERGED,
+    search: Limits = BRIEF,
 ) -> LensFit:
     """The fit without outliers: these are detected under a Cauchy loss and then excluded.
 
-    values must hold a pose for each view; a view whose pose is nan is excluded. Raises AdjustmentError: too few corners
-    remain, or they do not determine the parameters.
+    values must hold a pose for each view; a view whose pose is nan is excluded. search: of the outliers.
+
+    Raises AdjustmentError: too few corners remain, or they do not determine the parameters.
     """
     dropped = _without_pose(table, values)
     candidates = ~np.isin(table.view, list(dropped))
@@ -125,7 +131,7 @@ def robust_fit(
     noise = table.noise[:, None]
     sigma = _spread((_residuals(table, candidates, model, values) / noise)[candidates])
     for _ in range(2):  # the scale of the loss is from residuals, which the first round reduces
-        adjusted = adjust(table, candidates, model, values, board, FitSettings(sigma, Cauchy(), BRIEF))
+        adjusted = adjust(table, candidates, model, values, board, FitSettings(sigma, Cauchy(), search))
         values = adjusted.values
         residuals = _residuals(table, candidates, model, values)
         smaller = _spread((residuals / noise)[candidates])

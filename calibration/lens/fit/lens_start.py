@@ -25,6 +25,9 @@ from geometry.pose import Pose
 TRIAL_VIEWS = 25  # enough to distinguish good starts from bad ones
 _PERSPECTIVE_GUESSES = (0.5, 0.9, 1.8)  # focal lengths over the longer side: 90, 58 and 31 deg across
 _FISHEYE_GUESSES = (1 / np.pi, 0.5, 0.9)  # 180, 115 and 64 deg across
+_FEW_PARAMETERS = np.isin(np.arange(INTRINSICS_COUNT), (0, 1, 4))  # solved first: from a bad start all may diverge
+_SAME_FOCAL = 0.01  # relative: short solves from two guesses end within .2 % of each other, or are tens of % apart
+_RIVAL = 1.3  # error of a short solve over the least one's up to which it may lead to the better start
 _WIDEST = np.deg2rad(75.0)  # off the axis: beyond it normalised image points, from which poses are found, diverge
 
 
@@ -40,29 +43,33 @@ def start(table: CornerTable, fisheye: bool) -> tuple[LensModel, Values]:
     model = LensModel(4, FISHEYE) if fisheye else LensModel(5)
     trial = table.only_views(_spread_out(table))
     best: tuple[float, Array] | None = None
-    mirrored = 0
-    guesses = _guesses(trial, fisheye)
-    for focal in guesses:
+    solved: dict[float, float] = {}  # focal length, px: error, px, of short solves from which full ones succeeded
+    seen, mirrored = 0, 0
+    for focal in _guesses(trial, fisheye):
         lens = _first_lens(focal, table.image_size_px)
         poses, back_to_front = board_poses(trial, lens, fisheye)
-        mirrored += back_to_front
+        seen, mirrored = seen + trial.views, mirrored + back_to_front
         found = np.asarray(np.isfinite(poses.translation).all(axis=1))
         trusted = found[trial.view]
         if not trusted.any():
             continue
         try:
-            values = _short_solve(trial, trusted, model, values_of(lens, poses, len(table.board_points)))
+            values = _solved(trial, trusted, model, values_of(lens, poses, len(table.board_points)), _FEW_PARAMETERS)
+            short, error = float(lens_of(values)[0]), _missed(trial, trusted, fisheye, values)
+            if any(abs(short / other - 1) < _SAME_FOCAL for other in solved):
+                break
+            if solved and error > _RIVAL * min(solved.values()):
+                continue
+            values = _solved(trial, trusted, model, values, model.free)
         except AdjustmentError:
             continue
-        left = np.linalg.norm(term_of(trial, trusted, fisheye).project(values) - trial.pixels[trusted], axis=1)
-        # The median tolerates up to half of the corners being wrong; a view without a pose counts as infinitely bad.
-        error = float(np.median(np.concatenate([left, np.full(len(trial) - len(left), np.inf)])))
+        solved[short], error = error, _missed(trial, trusted, fisheye, values)
         lens = lens_of(values)
         if folds_in_picture(lens, fisheye, table.image_size_px):
             error *= 1.5
         if best is None or error < best[0]:
             best = error, lens
-    if mirrored > len(guesses) * trial.views / 2:
+    if mirrored > seen / 2:
         raise StartError("the picture of the board is mirrored: its points are in the opposite sense of rotation")
     if best is None:
         raise StartError("no focal length and no pose of the board explain the corners")
@@ -100,15 +107,18 @@ def _first_lens(focal: float, image_size_px: tuple[int, int]) -> Array:
     return lens
 
 
-def _short_solve(table: CornerTable, used: Bools, model: LensModel, values: Values) -> Values:
-    """First focal lengths and k1 alone, then the rest: from a bad start, all parameters together may diverge."""
-    few_parameters = np.zeros(INTRINSICS_COUNT, dtype=bool)
-    few_parameters[[0, 1, 4]] = True
-    for lens_free in (few_parameters, model.free):
-        term = term_of(table, used, model.fisheye)
-        sigma = max(float(np.median(np.linalg.norm(term.project(values) - term.pixels, axis=1))), 0.05)
-        values = adjust(table, used, model, values, AS_STATED, FitSettings(sigma, Cauchy(), BRIEF), lens_free).values
-    return values
+def _solved(table: CornerTable, used: Bools, model: LensModel, values: Values, lens_free: Bools) -> Values:
+    """The values after a robust fit of some lens parameters (18,)."""
+    sigma = max(_missed(table, used, model.fisheye, values, np.nan), 0.05)
+    return adjust(table, used, model, values, AS_STATED, FitSettings(sigma, Cauchy(), BRIEF), lens_free).values
+
+
+def _missed(table: CornerTable, used: Bools, fisheye: bool, values: Values, of_others: float = np.inf) -> float:
+    """Median distance, px, of predicted corners, infinite of those not used: up to half of them may be wrong."""
+    away = np.full(len(table), of_others)
+    left = np.linalg.norm(term_of(table, used, fisheye).project(values) - table.pixels[used], axis=1)
+    away[used] = np.where(np.isfinite(left), left, np.inf)  # behind the camera
+    return float(np.nanmedian(away))
 
 
 def board_poses(table: CornerTable, lens: Array, fisheye: bool) -> tuple[Pose, int]:

@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.least_squares.adjustment import AdjustmentError, Values, Vectors
+from calibration.least_squares.adjustment import AdjustmentError, Limits, Values, Vectors
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
-from calibration.lens.fit.lens_adjustment import BRIEF
+from calibration.lens.fit.lens_adjustment import BRIEF, ROUGH
 from calibration.lens.fit.lens_fit import CORNER_GATE, LensFit, fit, robust_fit
 from calibration.lens.fit.lens_models import (
     LENS_MODELS,
@@ -118,7 +118,7 @@ def _futile(table: CornerTable, model: LensModel, smaller: Sequence[_Judged]) ->
     if model.coefficients < RATIONAL.coefficients:
         return ""
     fits = [j.candidate.fit for j in smaller if j.candidate.fit is not None and not j.scatters]
-    if any(beyond_noise(*cell_means(table, f), f.sigma_px)[0] >= PLAUSIBLE_NOISE for f in fits):
+    if any(_leaves_noise(table, f) for f in fits):
         return "a smaller model leaves no correlated residuals and no scatter between photographs"
     unknown = (j.unknown_px * max(1.0, j.scatter) for j in smaller if j.map and j.candidate.model == RATIONAL)
     if any(px > UNKNOWN_PX for px in unknown):
@@ -126,11 +126,21 @@ def _futile(table: CornerTable, model: LensModel, smaller: Sequence[_Judged]) ->
     return ""
 
 
+def _leaves_noise(table: CornerTable, found: LensFit) -> bool:
+    """Whether the residuals of a fit look like noise."""
+    return beyond_noise(*cell_means(table, found), found.sigma_px)[0] >= PLAUSIBLE_NOISE
+
+
 def _best_start(
     table: CornerTable, used: Bools, model: LensModel, starts: Sequence[Values | None], board: BoardFreedom
 ) -> ModelCandidate:
-    """The best fit of the model over the start values."""
-    candidates = [_fitted(table, used, model, start, board) for start in starts]
+    """The best fit of the model over the start values, up to the first that leaves only noise."""
+    candidates: list[ModelCandidate] = []
+    for start in starts:
+        candidates.append(_fitted(table, used, model, start, board))
+        found = candidates[-1].fit
+        if found is not None and len(starts) > 1 and _leaves_noise(table, found):
+            break
     return min(candidates, key=lambda r: np.inf if r.fit is None else r.fit.sigma_px)
 
 
@@ -296,8 +306,9 @@ def inliers_of_rich_models(
     """
     fits: list[LensFit] = []
     reasons: list[str] = []
-    for model, values in starts:
-        fits += _rich_fit(table, model, values, reasons)
+    for search in (BRIEF, ROUGH):
+        for model, values in () if fits else starts:
+            fits += _rich_fit(table, model, values, reasons, search)
     leaves = [
         beyond_noise(*cell_means(table, f), f.sigma_px)[0] < SIGNIFICANT or f.used.mean() < FEWEST_INLIERS for f in fits
     ]
@@ -305,7 +316,7 @@ def inliers_of_rich_models(
     tried = any(model == RATIONAL for model, _ in starts)
     if not tried and (wanted or (only is None and all(leaves))):
         for values in [as_rational(table, f) for f in fits]:
-            fits += _rich_fit(table, RATIONAL, values, reasons)
+            fits += _rich_fit(table, RATIONAL, values, reasons, BRIEF)
     if not fits:
         raise AdjustmentError(reasons[-1])
     gate = CORNER_GATE * min(f.sigma_px for f in fits)
@@ -316,11 +327,13 @@ def inliers_of_rich_models(
     return used, fits
 
 
-def _rich_fit(table: CornerTable, model: LensModel, values: Values, reasons: list[str]) -> list[LensFit]:
+def _rich_fit(
+    table: CornerTable, model: LensModel, values: Values, reasons: list[str], search: Limits
+) -> list[LensFit]:
     """The robust fit with the bend of the board free if it can be solved for; empty if not even the lens can."""
     for board in (BoardFreedom(warp=True), AS_STATED):
         try:
-            return [robust_fit(table, model, values, board, BRIEF)]
+            return [robust_fit(table, model, values, board, BRIEF, search)]
         except AdjustmentError as error:
             reasons.append(str(error))
     return []

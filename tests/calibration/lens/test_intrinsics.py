@@ -267,6 +267,19 @@ def of_two_lenses(first: tuple[float, ...], second: tuple[float, ...], counts: t
     return CornerTable.of(mixed, tables[0].board_points, tables[0].middle, SIZE)
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_two_photographs_in_which_a_small_copy_of_the_board_was_found_are_left_out(seed):
+    """On a monitor, or pasted: no pose explains them, and the search for outliers hardly converges."""
+    table = photographs(Scene(views=14, sigma_px=0.05), seed)
+    pixels = table.pixels.copy()
+    for view, corner in ((4, (0.0, 576.0)), (10, (768.0, 0.0))):
+        pixels[table.view == view] = 0.4 * pixels[table.view == view] + corner
+    found = calibrate_intrinsics(replace(table, pixels=pixels))
+    assert sorted(found.fit.dropped) == [4, 10]
+    assert found.model == LensModel(5)
+    assert np.all(np.abs(errors(found)) < 4 * found.sigmas)
+
+
 @pytest.mark.parametrize(
     ("second", "counts"),
     [
