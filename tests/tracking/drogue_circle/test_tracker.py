@@ -150,6 +150,16 @@ def test_any_detector_that_proposes_coarse_circles_can_be_used():
     assert np.hypot(frame.state[0] - 80.3, frame.state[1] - 60.2) < 0.05
 
 
+def test_a_circle_from_which_no_rim_is_reached_does_not_exclude_one_beside_it():
+    """The first one is 10 px off, 4 px beyond what the rays reach; the other lies within .15 radii of it."""
+
+    def coarse(picture, window):
+        return [CircleCandidate(88.0, 66.0, 50.0, 1.1, -1), CircleCandidate(83.5, 61.5, 49.0, 0.9, -1)]
+
+    frame = CircleTracker(coarse, P).step(discs([(80.0, 60.0, 50.0)]))
+    assert np.hypot(frame.state[0] - 80.0, frame.state[1] - 60.0) < 0.05
+
+
 def test_the_printed_form_follows_a_clear_disc_to_a_pixel_or_two():
     tracker = PrintedTracker(classical_detector(P), P)
     for k in range(15):
