@@ -398,6 +398,7 @@ def nothing_known(cause: Cause, event: str = "") -> CircleFrame:
 _CONFIRMED = 3  # measurements after which an acquisition is confirmed: till then each is as certain as the first one
 _CHANGED = 4  # searches of the whole picture after which a circle of another appearance is accepted
 _FORGOTTEN = 50  # searches for a circle like the lost one, after which any circle is accepted
+_COMPARED_RADII = 0.25  # largest sigma of a predicted place, in radii, of which the occlusion coefficient is reported
 _NEAR_PX = 20.0  # distance of the first circle from the place that the user states
 
 
@@ -494,6 +495,7 @@ class CircleTracker:
         x, P = track.bank.state()
         sigma = float(np.sqrt(max(P[0, 0], P[1, 1])))
         certain = sigma <= self.parameters.lost_sigma_radii * max(float(x[2]), 1.0)
+        gamma = gamma if sigma <= _COMPARED_RADII * x[2] else np.nan  # of a place where the target may not be
         if certain and x[2] > 2 and track.misses <= self.parameters.most_predicted:
             return CircleFrame(PoseStatus.PREDICTED, cause, x, P, predicted, None, gamma)
         self._track = None

@@ -61,6 +61,21 @@ def test_a_disc_that_is_fully_hidden_for_eight_frames_is_predicted_within_two_pi
             assert frame.occlusion > 0.5
 
 
+def test_the_coefficient_of_a_predicted_place_is_unknown_once_the_place_is():
+    """Before, it was that of whatever is where the circle is predicted, tens of pixels beside the target."""
+    tracker = new_tracker()
+    frames = []
+    for k in range(40):
+        shown = discs([(80.0 + 20 * np.sin(k / 3), 60.0, 20.0)], seed=k)
+        frames.append(tracker.step(covered(shown, (0, 160), (0, 120)) if k > 12 else shown))
+    predicted = [f for f in frames if f.status is PoseStatus.PREDICTED]
+    known = [np.isfinite(f.occlusion) for f in predicted]
+    sure = [np.sqrt(f.covariance[:2, :2].trace() / 2) < 0.25 * f.state[2] for f in predicted]
+    assert predicted[0].occlusion > 0.9
+    assert not known[-1]
+    assert known == sure or abs(sum(known) - sum(sure)) == 1  # the larger axis counts
+
+
 def test_a_second_equal_disc_does_not_take_over():
     tracker = new_tracker()
     for k in range(4, 22):
