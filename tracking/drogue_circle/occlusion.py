@@ -16,7 +16,8 @@ from geometry.arrays import Array, Bools, upper_median
 from tracking.drogue_circle.rim_fit import SECTORS, RimFit
 from tracking.noise import Picture
 
-_RINGS, _SECTORS = 10, SECTORS
+_RINGS, _FINE = 20, 2  # of the cells, and their sectors in one of the rim's: 1280 of a 20th of the radius
+_INSET_PX, _LARGEST_PX = 1.0, 60.0  # from the rim, whose blur mixes with what is behind; radius without reduction
 _MATCH = 3.0  # mean absolute deviations within which a cell looks as before
 _LEAST_DEVIATION = 0.06  # least deviation, as a share of the contrast of the target
 _LIGHT = 0.15  # largest change of the light from the mean appearance, as a share of the grey level
@@ -27,7 +28,7 @@ _USUAL_RMS, _LEAST_RMS_PX = 2.0, 0.3  # times the mean residual of the rim, and 
 _CLEAR = 0.2  # coefficient below which the rim of a frame is that of a clear target
 _CHANGED = 1 / 500  # rate at which cells that look different become the appearance: no probe stays for that long
 _RHO = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)  # cells of equal area
-_THETA = 2 * np.pi * (np.arange(_SECTORS) + 0.5) / _SECTORS
+_THETA = 2 * np.pi * (np.arange(_FINE * SECTORS) + 0.5) / (_FINE * SECTORS)
 _X, _Y = np.outer(_RHO, np.cos(_THETA)), np.outer(_RHO, np.sin(_THETA))
 
 
@@ -42,13 +43,19 @@ class Appearance:
 
     def coefficient(self, cells_dn: Array, inside: Bools) -> float:
         """gamma of the cells (rings, sectors) of a frame, 0 to 1. Cells outside the picture count as not seen."""
-        filled = float(np.mean(self._matching(cells_dn, inside)))  # share of the cells that look as before
+        same, away = self._compared(cells_dn, inside)
+        # The blurred outline of an occluder reaches over cells beside it: those more like the target than like the
+        # occluder near them are seen.
+        weight = np.where(inside & ~same, away**2, 0.0)
+        occluder_dn = _mean_near(weight * cells_dn) / np.maximum(_mean_near(weight), 1e-9)
+        beside = inside & (_mean_near(same) > 0.01) & (away < np.abs(cells_dn - occluder_dn))
+        filled = float(np.mean(same | beside))  # share of the cells that look as before
         return float(np.clip(1 - filled / max(self.fill, 0.05), 0.0, 1.0))
 
     def hidden_sectors(self, cells_dn: Array, inside: Bools) -> Bools:
         """Sectors (sectors,) that look different next to the rim: the edges there are those of an occluder."""
-        outer = _RHO > _NEXT_TO_RIM
-        return np.asarray(np.mean(self._matching(cells_dn, inside)[outer], axis=0) < _SECTOR_SHARE)
+        outer = self._compared(cells_dn, inside)[0][_RHO > _NEXT_TO_RIM].reshape(-1, SECTORS, _FINE)
+        return np.asarray(np.mean(outer, axis=(0, 2)) < _SECTOR_SHARE)
 
     def updated(self, cells_dn: Array, inside: Bools) -> Appearance:
         """The appearance with one more frame.
@@ -59,7 +66,7 @@ class Appearance:
         new = self.frames < _FIRST
         rate = max(_RATE, 1 / (self.frames + 1)) if new else _RATE
         away = cells_dn - self.mean_dn
-        same = self._matching(cells_dn, inside)
+        same, _ = self._compared(cells_dn, inside)
         away = away - upper_median(away[inside & same] if same.any() else away[inside])
         step = np.where(inside, np.where(same | new, rate, _CHANGED), 0.0)
         filled = float(np.mean(same)) - self.fill
@@ -71,10 +78,10 @@ class Appearance:
             self.frames + 1,
         )
 
-    def _matching(self, cells_dn: Array, inside: Bools) -> Bools:
-        """Which cells look as before, apart from a change of the light, which is common to all."""
+    def _compared(self, cells_dn: Array, inside: Bools) -> tuple[Bools, Array]:
+        """Which cells look as before, apart from a change of the light, which is common to all; the differences, DN."""
         if inside.mean() < 0.2:
-            return np.zeros(inside.shape, dtype=bool)
+            return np.zeros(inside.shape, dtype=bool), np.zeros(inside.shape)
         low, high = _contrast(self.mean_dn)
         tolerance = _MATCH * np.maximum(self.deviation_dn, max(_LEAST_DEVIATION * (high - low), 2.0))
         away = cells_dn - self.mean_dn
@@ -82,8 +89,15 @@ class Appearance:
         # the target is hidden, the median may be that of the occluder: no change is tried, too.
         most = _LIGHT * max(abs(upper_median(self.mean_dn)), 1.0)
         common = float(np.clip(upper_median(away[inside]), -most, most))
-        plain, corrected = (inside & (np.abs(away - change) < tolerance) for change in (0.0, common))
-        return np.asarray(corrected if corrected.sum() > plain.sum() else plain)
+        both = [np.abs(away - change) for change in (0.0, common)]
+        plain, corrected = (inside & (size < tolerance) for size in both)
+        return (corrected, both[1]) if corrected.sum() > plain.sum() else (plain, both[0])
+
+
+def _mean_near(values: Array | Bools) -> Array:
+    """Means of values (rings, sectors) over five by five cells."""
+    around = np.pad(values.astype(np.float32), ((0, 0), (2, 2)), mode="wrap")
+    return np.asarray(cv2.blur(around, (5, 5)), float)[:, 2:-2]
 
 
 def first_appearance(cells_dn: Array, inside: Bools) -> Appearance:
@@ -116,7 +130,7 @@ class RimHabit:
     @property
     def without_edge(self) -> Bools:
         """Sectors (sectors,) whose edges are usually not those of the rim."""
-        return np.asarray(self.sectors < _USUAL) if self.frames >= _FIRST else np.zeros(_SECTORS, dtype=bool)
+        return np.asarray(self.sectors < _USUAL) if self.frames >= _FIRST else np.zeros(SECTORS, dtype=bool)
 
     def is_usual(self, fit: RimFit) -> bool:
         """Whether the residuals of a fit are those of the rim; a mixture of two edges has larger ones."""
@@ -137,18 +151,21 @@ def is_clear(coefficient: float) -> bool:
 def disc_cells(picture: Picture, u_px: float, v_px: float, radius_px: float) -> tuple[Array, Bools]:
     """Grey values of the disc in cells of equal area, and which of them lie in the picture, both (rings, sectors).
 
-    Each value is a bilinear sample; discs much larger than the cells are first reduced, so that a cell is a mean.
+    Each value is a bilinear sample. Large discs are first reduced, by a factor that changes with the radius without
+    steps: a cell is a mean.
     """
     height, width = picture.shape[:2]
-    x, y = u_px + radius_px * _X, v_px + radius_px * _Y
+    reach = max(radius_px - _INSET_PX, 0.5 * radius_px)
+    x, y = u_px + reach * _X, v_px + reach * _Y
     inside: Bools = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     left, top = max(int(np.floor(u_px - radius_px)) - 2, 0), max(int(np.floor(v_px - radius_px)) - 2, 0)
     right, bottom = int(np.ceil(u_px + radius_px)) + 3, int(np.ceil(v_px + radius_px)) + 3
     crop = picture[top : max(bottom, top), left : max(right, left)].astype(np.float32)
     if min(crop.shape) < 3:
         return np.zeros(x.shape), np.zeros(x.shape, dtype=bool)
-    side = int(max(round(radius_px / _RINGS), 1))
-    if side > 1:
-        crop = np.asarray(cv2.blur(crop, (side, side)), np.float32)
-    cells = cv2.remap(crop, (x - left).astype(np.float32), (y - top).astype(np.float32), cv2.INTER_LINEAR)
+    scale = min(_LARGEST_PX / radius_px, 1.0)
+    if scale < 1:
+        crop = np.asarray(cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.float32)
+    columns, rows = (((k + 0.5) * scale - 0.5).astype(np.float32) for k in (x - left, y - top))
+    cells = cv2.remap(crop, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.where(inside, cells, 0.0).astype(float), inside

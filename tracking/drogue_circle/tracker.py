@@ -18,6 +18,9 @@ from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
 _MOST_FITTED = 24  # of the whole picture
+_AGAIN_PX = (
+    2.0  # distance from a circle that led to no fit, from which another one is tried: the first rays are 4 px long
+)
 _SAME_CENTRE = 0.6  # distance of two centres, as a share of the larger radius, below which they are one target
 _RIM_SHARE = 0.92  # score of the outermost circle of a target, as a share of the best one's, that makes it the rim
 _LEAST_POINTS = 12  # independent edge points: texture often gives a short arc of a small circle
@@ -140,18 +143,18 @@ def _fitted(
 ) -> list[RimFit]:
     """The candidates that fit a rim and what is wanted."""
     fits: list[RimFit] = []
-    tried: list[CircleCandidate] = []
+    tried: list[tuple[CircleCandidate, float]] = []  # and how near another one leads to the same fit, px
     for c in candidates:
         if len(tried) >= _MOST_FITTED:
             break
         coarse = c.u_px, c.v_px, c.radius_px, c.polarity
-        if not _may_be(*coarse, wanted, 0.3 * c.radius_px + 4, 1.3) or any(_is_near(c, t) for t in tried):
+        if not _may_be(*coarse, wanted, 0.3 * c.radius_px + 4, 1.3) or any(_is_near(c, *t) for t in tried):
             continue
-        tried.append(c)
         half = 1.3 * c.radius_px + 10
         window = Window(c.u_px, c.v_px, half, p.gate_px, p.min_radius_px, 2 * c.radius_px)
         crop = smooth_crop(picture, window, p.blur_px)
         fit = fit_rim(crop, c, p.acquire_coverage)
+        tried.append((c, _AGAIN_PX if fit is None else np.inf))
         if fit is not None and is_certain(fit, _START_RMS):
             fit = _best_near(crop, fit, p)
         largest = p.max_radius_px or 0.5 * max(picture.shape[:2])
@@ -213,9 +216,9 @@ def _may_be(
     return not wanted.polarity or polarity in (0, wanted.polarity)
 
 
-def _is_near(c: CircleCandidate, other: CircleCandidate) -> bool:
-    """Whether two coarse circles are the same."""
-    close = np.hypot(c.u_px - other.u_px, c.v_px - other.v_px) < max(2.0, 0.15 * c.radius_px)
+def _is_near(c: CircleCandidate, other: CircleCandidate, within_px: float) -> bool:
+    """Whether two coarse circles are the same, if circles within some px are."""
+    close = np.hypot(c.u_px - other.u_px, c.v_px - other.v_px) < min(max(2.0, 0.15 * c.radius_px), within_px)
     return bool(close and abs(c.radius_px - other.radius_px) < 2.5 and c.polarity == other.polarity)
 
 
@@ -395,6 +398,7 @@ def nothing_known(cause: Cause, event: str = "") -> CircleFrame:
 _CONFIRMED = 3  # measurements after which an acquisition is confirmed: till then each is as certain as the first one
 _CHANGED = 4  # searches of the whole picture after which a circle of another appearance is accepted
 _FORGOTTEN = 50  # searches for a circle like the lost one, after which any circle is accepted
+_COMPARED_RADII = 0.25  # largest sigma of a predicted place, in radii, of which the occlusion coefficient is reported
 _NEAR_PX = 20.0  # distance of the first circle from the place that the user states
 
 
@@ -491,6 +495,7 @@ class CircleTracker:
         x, P = track.bank.state()
         sigma = float(np.sqrt(max(P[0, 0], P[1, 1])))
         certain = sigma <= self.parameters.lost_sigma_radii * max(float(x[2]), 1.0)
+        gamma = gamma if sigma <= _COMPARED_RADII * x[2] else np.nan  # of a place where the target may not be
         if certain and x[2] > 2 and track.misses <= self.parameters.most_predicted:
             return CircleFrame(PoseStatus.PREDICTED, cause, x, P, predicted, None, gamma)
         self._track = None

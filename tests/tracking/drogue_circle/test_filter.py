@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
-from tests.tracking.drogue_circle.discs import covered, discs
+from tests.tracking.drogue_circle.discs import BLUR_PX, covered, discs, rounded
 from tracking.drogue_circle.kalman import (
     FilterBank,
     MotionModel,
@@ -103,6 +104,52 @@ def test_the_occlusion_coefficient_is_the_hidden_share_of_the_area():
     sectors = appearance.hidden_sectors(*half)  # the left half: angles beyond 90 degrees on both sides
     assert not sectors[:7].any()
     assert sectors[9:23].all()
+
+
+def seen_clear(radius, first=0):
+    """The appearance after ten clear frames of a disc that grows by .02 px in each, and its last radius."""
+    appearance = first_appearance(*disc_cells(discs([(80.0, 60.0, radius)], seed=first), 80.0, 60.0, radius))
+    for k in range(1, 10):
+        radius += 0.02
+        cells = disc_cells(discs([(80.0, 60.0, radius)], seed=first + k), 80.0, 60.0, radius)
+        appearance = appearance.updated(*cells)
+    return appearance, radius
+
+
+@pytest.mark.parametrize("radius", [16.0, 30.0, 45.0])
+@pytest.mark.parametrize("columns", [(0, 68), (0, 80), (76, 88)])
+def test_the_blurred_outline_of_an_occluder_hides_half_of_its_width(radius, columns):
+    """To .02 of the area, .06 of a small one: before, each cell that the outline touches was hidden (.03 to .13)."""
+    appearance, radius = seen_clear(radius)
+    light = discs([(80.0, 60.0, radius)], noise=0.0).astype(float)
+    edges = np.array(columns) - 0.5
+    x = np.arange(160.0)
+    plate = norm.cdf((x - edges[0]) / BLUR_PX) - norm.cdf((x - edges[1]) / BLUR_PX)
+    picture = rounded(light + plate * (60.0 - light) + np.random.default_rng(5).normal(0, 1.5, light.shape))
+    fine = np.linspace(-1, 1, 2001) * radius
+    chords = 2 * np.sqrt(radius**2 - fine**2)
+    hidden = chords[(80 + fine > edges[0]) & (80 + fine < edges[1])].sum() / chords.sum()
+    assert appearance.coefficient(*disc_cells(picture, 80.0, 60.0, radius)) == pytest.approx(
+        hidden, abs=0.02 if radius > 20 else 0.06
+    )
+
+
+@pytest.mark.parametrize("radius", [14.8, 24.8])
+def test_a_target_that_grows_looks_as_before(radius):
+    """Before, the filter of the cells changed by a pixel at once, at 15 and 25 px: .07 and more of a clear target."""
+
+    def picture(radius, seed):
+        y, x = np.mgrid[:120, :160]
+        away = np.hypot(x - 80.0, y - 60.0)
+        light = 150 - 60 * norm.cdf((away - radius) / 0.8) - 80 * norm.cdf((0.55 * radius - away) / 0.8)
+        return rounded(light + np.random.default_rng(seed).normal(0, 1.0, light.shape))
+
+    appearance = first_appearance(*disc_cells(picture(radius, 0), 80.0, 60.0, radius))
+    for k in range(1, 40):
+        radius += 0.02
+        cells = disc_cells(picture(radius, k), 80.0, 60.0, radius)
+        assert appearance.coefficient(*cells) < 0.04
+        appearance = appearance.updated(*cells)
 
 
 def test_a_probe_that_comes_slowly_does_not_become_part_of_the_appearance():

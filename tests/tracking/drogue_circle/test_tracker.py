@@ -61,6 +61,21 @@ def test_a_disc_that_is_fully_hidden_for_eight_frames_is_predicted_within_two_pi
             assert frame.occlusion > 0.5
 
 
+def test_the_coefficient_of_a_predicted_place_is_unknown_once_the_place_is():
+    """Before, it was that of whatever is where the circle is predicted, tens of pixels beside the target."""
+    tracker = new_tracker()
+    frames = []
+    for k in range(40):
+        shown = discs([(80.0 + 20 * np.sin(k / 3), 60.0, 20.0)], seed=k)
+        frames.append(tracker.step(covered(shown, (0, 160), (0, 120)) if k > 12 else shown))
+    predicted = [f for f in frames if f.status is PoseStatus.PREDICTED]
+    known = [np.isfinite(f.occlusion) for f in predicted]
+    sure = [np.sqrt(f.covariance[:2, :2].trace() / 2) < 0.25 * f.state[2] for f in predicted]
+    assert predicted[0].occlusion > 0.9
+    assert not known[-1]
+    assert known == sure or abs(sum(known) - sum(sure)) == 1  # the larger axis counts
+
+
 def test_a_second_equal_disc_does_not_take_over():
     tracker = new_tracker()
     for k in range(4, 22):
@@ -148,6 +163,16 @@ def test_any_detector_that_proposes_coarse_circles_can_be_used():
 
     frame = CircleTracker(rough, P).step(discs([(80.3, 60.2, 20.0)]))
     assert np.hypot(frame.state[0] - 80.3, frame.state[1] - 60.2) < 0.05
+
+
+def test_a_circle_from_which_no_rim_is_reached_does_not_exclude_one_beside_it():
+    """The first one is 10 px off, 4 px beyond what the rays reach; the other lies within .15 radii of it."""
+
+    def coarse(picture, window):
+        return [CircleCandidate(88.0, 66.0, 50.0, 1.1, -1), CircleCandidate(83.5, 61.5, 49.0, 0.9, -1)]
+
+    frame = CircleTracker(coarse, P).step(discs([(80.0, 60.0, 50.0)]))
+    assert np.hypot(frame.state[0] - 80.0, frame.state[1] - 60.0) < 0.05
 
 
 def test_the_printed_form_follows_a_clear_disc_to_a_pixel_or_two():

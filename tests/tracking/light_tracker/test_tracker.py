@@ -211,6 +211,18 @@ def test_of_two_targets_none_is_chosen_unless_the_place_is_stated():
     assert np.hypot(*(stated.centre_px - circles[1][:2])) < 3
 
 
+@pytest.mark.parametrize(("second", "chosen"), [(0.9, False), (0.7, True)])
+def test_a_second_detection_that_is_sure_by_itself_makes_the_choice_ambiguous(second, chosen):
+    """Of two equal drogues the detector may give one .99 and the other .9: before, the first was tracked in silence."""
+
+    def detector(image, window):
+        return [CircleCandidate(50.0, 60.0, 7.0, 0.995), CircleCandidate(140.0, 90.0, 7.0, second)]
+
+    frame = DrogueTracker(detector).step(picture([(50.0, 60.0, 14.0), (140.0, 90.0, 14.0)]))
+    assert frame.status is (PoseStatus.MEASURED if chosen else PoseStatus.LOST)
+    assert frame.cause is (Cause.NONE if chosen else Cause.AMBIGUOUS)
+
+
 def test_a_second_target_that_appears_later_does_not_matter():
     detector = Detector()
     tracker = DrogueTracker(detector)

@@ -108,6 +108,12 @@ def test_several_edges_about_one_centre_are_reported_unless_one_is_chosen(tmp_pa
     assert float(rows(tmp_path / "out")[0]["radius_px"]) == pytest.approx(41.5, abs=1.2)
 
 
+def test_a_disc_without_the_chosen_edge_is_not_found_and_the_message_names_the_option(folder, tmp_path):
+    done = typed(folder, "--out", tmp_path / "out", "--edge", "inner")
+    assert done.exit_code == 4
+    assert "has the target the chosen edge (--edge)" in done.output
+
+
 def test_the_printed_form_is_another_tracker(folder, tmp_path):
     track_target(CircleTarget(CircleOptions(form="printed")), folder, tmp_path / "out")
     table = rows(tmp_path / "out")
