@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import permutations
 from types import MappingProxyType
 from typing import Any
 
@@ -81,7 +82,7 @@ def judge(
         found.append(finding("BP-V23", Level.WARN, what, numbers={"camera": name}))
     found += _measured(statistics)
     if statistics.measured:
-        found += _cameras(statistics)
+        found += _cameras(statistics) + _numbering(statistics)
     if noise_scale is not None:
         found += _noise_scale(noise_scale)
     found += [f for f in given if f.code != _SET_UP]
@@ -289,6 +290,24 @@ def _cameras(statistics: RunStatistics) -> list[Finding]:
                 " spots inside them"
             )
             out.append(finding("BP-V08", Level.WARN, what, numbers=numbers))
+    return out
+
+
+def _numbering(statistics: RunStatistics) -> list[Finding]:
+    """Two cameras of which one shows nothing in its first pictures, the other nothing in as many of its last ones."""
+    out = []
+    for (a, late), (b, early) in permutations(statistics.cameras.items(), 2):
+        shift = late.empty_at_start
+        if not (late.expected_at_start and early.expected_at_end) or late.empty_at_end or early.empty_at_start:
+            continue
+        if shift == early.empty_at_end:
+            what = (
+                f"camera {a} shows nothing in its first {format_count(shift, 'frame')}, and camera {b} nothing in its"
+                f" last {format_count(shift, 'frame')}, where the poses put spots inside: their frames may be numbered"
+                f" from {shift} and from 0"
+            )
+            numbers = {"cameras": [a, b], "frames": shift}
+            out.append(finding("BP-V05", Level.WARN, what, variant="numbers", numbers=numbers))
     return out
 
 

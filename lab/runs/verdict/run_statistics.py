@@ -278,6 +278,8 @@ class CameraStatistics:
     expected: int = 0  # spots that the pose puts inside the pictures
     found: int = 0  # expected spots that were measured
     unlabelled: int = 0  # pictures with points enough for two or more expected spots, none of which was measured
+    empty_at_start: int = 0  # pictures before the first one that has a point of light
+    expected_at_start: int = 0  # spots that the pose puts inside those
     empty_at_end: int = 0  # pictures since the last one that has a point of light
     expected_at_end: int = 0  # spots that the pose puts inside those
     missing: FrameRanges = field(default_factory=FrameRanges)  # frames without a usable picture
@@ -404,6 +406,7 @@ class RunStatistics:
             camera.pictures += 1
             camera.empty += len(found) == 0
             camera.points += len(found)
+            camera.empty_at_start += camera.points == 0
             if len(found):
                 camera.empty_at_end = camera.expected_at_end = 0
             else:
@@ -414,6 +417,7 @@ class RunStatistics:
                 expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
                 camera.expected += expected
                 camera.unlabelled += 2 <= expected <= len(found) and not any(s.measured for s in own)
+                camera.expected_at_start += expected if camera.points == 0 else 0
                 camera.expected_at_end += expected if camera.empty_at_end else 0
                 labelled = [v for v in views if status[v].measured]
                 measured = record.tracked.pose_status is PoseStatus.MEASURED

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import weakref
 from collections import Counter
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -338,6 +340,23 @@ def test_a_camera_that_stops_or_starts_late_is_reported(tmp_path):
         == "camera left stopped before the end: it has no picture from frame 12 on (2 frames)"
     )
     assert reasons["camera_late"]["what"] == "camera right starts late: it has no picture of the first 1 frame"
+
+
+@pytest.mark.parametrize("shift", [0, 1, 3])
+@pytest.mark.parametrize("camera", ["left", "right"])
+def test_points_whose_frames_are_numbered_differently_in_two_cameras_never_pass(tmp_path, camera, shift):
+    """Where the motion is slow the residuals hardly show it: all poses combine points of different instants."""
+    folder = points_run(tmp_path / "run", frames=24)
+    points = pd.read_csv(folder / "detections.csv")
+    points.loc[points["camera"] == camera, "frame"] += shift
+    points.sort_values(["frame", "camera"], kind="stable").to_csv(folder / "detections.csv", index=False)
+    shutil.rmtree(folder / "truth")
+    process_run(folder, tmp_path / "out")
+    verdict = json.loads((tmp_path / "out" / "summary.json").read_text())["verdict"]
+    named = [e["what"] for e in verdict["evidence"] if f"numbered from {shift} and from 0" in e["what"]]
+    assert len(named) == (shift > 0)
+    assert all(what.startswith(f"camera {camera} shows nothing in its first {shift} frame") for what in named)
+    assert verdict["status"] != "pass" or not shift
 
 
 def test_a_vehicle_that_is_lost_only_in_the_causal_pass_is_not_reported_as_lost(tmp_path, monkeypatch):
