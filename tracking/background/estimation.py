@@ -68,10 +68,11 @@ def static_background(
         return None
     few = len(background.lights.found) < _MANY_LIGHTS and not in_any_case
     if few and any(len(background.spots_in(p, parameters, shift)) for p in some[::TRIED]):
-        # A few pictures decide, unless one of them shows a better spot.
-        for tried in (some[::TRIED], some):
-            better = sum(_better_in(background, p, shift) for p in tried)
-            enough = better >= max(_LEAST_FOUND * len(tried), 2)
+        # A few pictures decide, unless one of them shows a better spot; then the others count as well.
+        asked = better = 0
+        for part in (some[::TRIED], [p for i, p in enumerate(some) if i % TRIED]):
+            asked, better = asked + len(part), better + sum(_better_in(background, p, shift) for p in part)
+            enough = better >= max(_LEAST_FOUND * asked, 2)
             if enough or not better:
                 break
         if not enough:

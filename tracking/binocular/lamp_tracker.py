@@ -109,9 +109,8 @@ class LampTracker:
         return place, sigmas
 
 
-# Corners of lamps in a picture (Harris), with the centroid of the light at each.
-
-# Corners by the Harris method, with the response and the window of Fu (2016).
+# Corners of lamps in a picture by the Harris method, with the response and the window of Fu (2016), and the centroid of
+# the light at each.
 #
 # Source: Fu et al. (2016), eqs. (6) and (7); the response det(M) / (tr(M) + epsilon) is Noble's form, "Finding
 # corners", Image and Vision Computing 6(2), 1988, of Harris & Stephens (1988).

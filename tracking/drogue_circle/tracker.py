@@ -18,9 +18,8 @@ from tracking.noise import Picture
 from tracking.statuses import Cause, PoseStatus
 
 _MOST_FITTED = 24  # of the whole picture
-_AGAIN_PX = (
-    2.0  # distance from a circle that led to no fit, from which another one is tried: the first rays are 4 px long
-)
+# Distance from a circle that led to no fit, from which another one is tried: the first rays are 4 px long.
+_AGAIN_PX = 2.0
 _SAME_CENTRE = 0.6  # distance of two centres, as a share of the larger radius, below which they are one target
 _RIM_SHARE = 0.92  # score of the outermost circle of a target, as a share of the best one's, that makes it the rim
 _LEAST_POINTS = 12  # independent edge points: texture often gives a short arc of a small circle

@@ -307,8 +307,10 @@ def inliers_of_rich_models(
     fits: list[LensFit] = []
     reasons: list[str] = []
     for search in (BRIEF, ROUGH):
-        for model, values in () if fits else starts:
+        for model, values in starts:
             fits += _rich_fit(table, model, values, reasons, search)
+        if fits:
+            break
     leaves = [
         beyond_noise(*cell_means(table, f), f.sigma_px)[0] < SIGNIFICANT or f.used.mean() < FEWEST_INLIERS for f in fits
     ]

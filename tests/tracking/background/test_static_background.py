@@ -214,7 +214,7 @@ def test_bright_spots_need_no_background():
     assert Recording.of(path(45, 6, 4.0, 7), 180.0).background() is None
 
 
-@pytest.mark.parametrize(("better", "used", "asked"), [({6, 7, 11}, True, 20), ({6, 7}, False, 20), ({7}, False, 5)])
+@pytest.mark.parametrize(("better", "used", "asked"), [({6, 7, 11}, True, 15), ({6, 7}, False, 15), ({7}, False, 5)])
 def test_all_pictures_decide_where_few_show_one_better_spot(better, used, asked, monkeypatch):
     """Objects that hide spots in some places, which a spot passes in one of the five pictures that decide at first."""
     recording, calls = Recording.of(path(45, 6, 4.0, 7), 180.0), []
@@ -225,7 +225,7 @@ def test_all_pictures_decide_where_few_show_one_better_spot(better, used, asked,
 
     monkeypatch.setattr(estimation, "_better_in", better_in)
     assert (recording.background() is not None) == used
-    assert len(calls) == asked
+    assert len(calls) == len(set(calls)) == asked  # no picture twice
     assert calls[:5] == [0, 3, 6, 9, 12]
 
 
