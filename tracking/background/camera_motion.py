@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array, Bools, Ints, robust_sigma
 from geometry.camera import Camera
 from geometry.compilation.jit import compiled_for_threads
+from tracking.background.mean_pictures import means_of
 from tracking.background.places import AROUND_LIGHT, places_of
 from tracking.detection.detect import find_spots, saturation_of
 from tracking.detections import Detections
@@ -46,6 +47,7 @@ _NEAR_PX, _ON_PX = 0.03, 0.005  # a movement that is not undone but corrected; o
 _OUTLIER = 3.0  # sigmas: what a landmark leaves counts in full up to this, and not at all beyond twice of it
 _LARGEST_MISFIT = 1.6  # sigma of what the landmarks leave over their noise; above it something else has changed
 _UNDETERMINED = 1e12  # condition of the fit: of long focal lengths, where a rotation is nearly a shift, up to 1e9
+_MIDDLE_VARIANCE = 1.2  # variance of the mean of the middle half of normal deviates times their number
 _MOSTLY, _STILL_SHARE = 0.85, 0.5  # of the pictures, in which a landmark stands still; least share of those that do
 _LEAST_PX = 0.01  # movements with a smaller root mean square are none: few spots are better than that
 _CLEAR = 0.75  # times its error, which is 3.5 times that of landmarks with noise of their own: a movement is corrected
@@ -86,6 +88,7 @@ class CameraMotion:
     mean_motion: Array  # (5,): of the pictures that `stilled` gives, from the landmarks
     offset: Array  # (5,): mean of the recording, from those pictures
     rms_px: float = 0.0  # of the movements
+    farthest_px: float = 0.0  # between two pictures
     mean_variance_px2: float = 0.0  # of their mean, along each axis: the same in all pictures
     pictures: int = 1  # from which the mean is known
 
@@ -94,20 +97,20 @@ class CameraMotion:
         pictures: Sequence[Picture], camera: Camera, noise: NoiseModel, parameters: DetectParameters
     ) -> CameraMotion | None:
         """From pictures spread over a recording. None: the camera stands still, or they do not show that it moves."""
-        size = camera.image_size_px
-        if len(pictures) < _LEAST_PICTURES or any(p.shape[::-1] != size for p in pictures) or min(size) < _SMALLEST_PX:
+        if not pictures:
             return None
         middle, clips = pictures[len(pictures) // 2], saturation_of(parameters, pictures[0])
-        motion = _landmarks(middle.astype(np.float32), 1, np.zeros(middle.shape, bool), camera, noise, _FEW)
-        turned = motion._turns_in(pictures, clips)
-        if turned is None or (about := motion._about_mean([turn for _, turn in turned])) is None:
+        if (seen := CameraMotion.at_first(pictures, camera, noise, clips)) is None:
             return None
-        # The noise of one picture makes slopes too steep, that of a mean less.
-        moved = [moved_by(p, motion._movement(turn.motion - about.mean_motion), clips) for p, turn in turned]
-        mean = np.asarray(sum(moved) / len(moved))
+        # The noise of one picture makes slopes too steep, that of a mean less. In the middle half of the values is no
+        # light that moves, whose traces would be the landmarks of an even wall.
+        about, at_first = seen
+        moved = [moved_by(p, about._movement(turn.motion - about.mean_motion), clips) for p, turn in at_first]
+        mean = means_of(moved)[1]
         lit = places_of(find_spots(middle, parameters, noise), middle.shape, AROUND_LIGHT) | (mean >= clips)
-        motion = _landmarks(mean, len(moved), lit, camera, noise, _PER_TILE)
-        if (turned := motion._turns_in(pictures, clips)) is None:
+        motion = _landmarks(mean, len(moved) / _MIDDLE_VARIANCE, lit, camera, noise, _PER_TILE)
+        turned = motion._turns_in(pictures, clips)
+        if turned is None:
             return None
         fits = [motion._fitted(moved_by(p, turn.movement, clips), 0.0) for p, turn in turned]
         still = np.mean([fit.left < _OUTLIER for fit in fits if fit is not None], axis=0) > _MOSTLY
@@ -117,13 +120,27 @@ class CameraMotion:
         turned = motion._turns_in(pictures, clips)
         return None if turned is None else motion._about_mean([turn for _, turn in turned])
 
+    @staticmethod
+    def at_first(
+        pictures: Sequence[Picture], camera: Camera, noise: NoiseModel, clips: float
+    ) -> tuple[CameraMotion, list[tuple[Picture, Turn]]] | None:
+        """That of a few landmarks of a single picture, and the pictures that show their turns. None: as in `of`."""
+        size = camera.image_size_px
+        if len(pictures) < _LEAST_PICTURES or any(p.shape[::-1] != size for p in pictures) or min(size) < _SMALLEST_PX:
+            return None
+        middle = pictures[len(pictures) // 2]
+        motion = _landmarks(middle.astype(np.float32), 1, np.zeros(middle.shape, bool), camera, noise, _FEW)
+        turned = motion._turns_in(pictures, clips)
+        about = None if turned is None else motion._about_mean([turn for _, turn in turned])
+        return None if turned is None or about is None else (about, turned)
+
     def with_mean_of(self, pictures: Sequence[Picture], clips: float) -> CameraMotion:
         """With the mean attitude of more pictures of the recording for that to which spots are corrected."""
         motions = np.array([turn.motion for _, turn in self._turns_in(pictures, clips) or ()])
         if len(motions) <= self.pictures:
             return self
-        variance = _variance_of_mean((motions - motions.mean(axis=0)) @ self._middle.T)
-        return replace(self, offset=motions.mean(axis=0), mean_variance_px2=variance, pictures=len(motions))
+        moved = (motions - motions.mean(axis=0)) @ self._middle.T
+        return replace(self, offset=motions.mean(axis=0), pictures=len(motions))._with_spread(moved)
 
     def stilled(self, picture: Picture, clips: float) -> tuple[Picture | None, Turn | None]:
         """A picture (h, w) moved to where the camera does not turn, and its turn, which `corrected` needs.
@@ -210,10 +227,13 @@ class CameraMotion:
         rms = float(np.sqrt(np.mean(moved**2)))
         if rms < max(_LEAST_PX, _CLEAR * float(np.sqrt(error2))):
             return None
-        return replace(
-            self, mean_motion=self.mean_motion + mean, rms_px=rms, mean_variance_px2=_variance_of_mean(moved),
-            pictures=len(turns),
-        )  # fmt: skip
+        about = replace(self, mean_motion=self.mean_motion + mean, rms_px=rms, pictures=len(turns))
+        return about._with_spread(moved)
+
+    def _with_spread(self, moved: Array) -> CameraMotion:
+        """With what movements (n, 2) from their mean, px, show of its error, and how far they are apart."""
+        farthest_px = float(np.linalg.norm(np.ptp(moved, axis=0)))
+        return replace(self, farthest_px=farthest_px, mean_variance_px2=_variance_of_mean(moved))
 
     def _seen(self, picture: NDArray[Any]) -> Array:
         """(k,), DN: what is in a picture at the landmarks."""
@@ -395,11 +415,11 @@ def _movements(camera: Camera, pixels: Array | Ints) -> Array:
 
 
 def _landmarks(
-    grey: NDArray[np.float32], pictures: int, lit: Bools, camera: Camera, noise: NoiseModel, per_tile: int
+    grey: NDArray[np.float32], pictures: float, lit: Bools, camera: Camera, noise: NoiseModel, per_tile: int
 ) -> CameraMotion:
     """The pixels of a mean of pictures (h, w) with the steepest structure, but for lights and for what is beside them.
 
-    lit (h, w): lights.
+    pictures: the number whose mean has its variance. lit (h, w): lights.
     """
     plain = np.asarray(cv2.medianBlur(grey, 3), np.float32)
     variance = np.asarray(noise.variance(plain) / pictures, np.float32)

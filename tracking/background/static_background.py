@@ -208,7 +208,7 @@ class StaticBackground:
         fit = fit or self.shown.in_picture(picture)
         if fit is None:
             return None
-        spots = self._moving(picture, parameters, shift, fit)
+        spots, hidden = self._moving(picture, parameters, shift, fit)
         lights, changed, passed = self.lights.in_picture(picture, self.fixed)
         # A lamp that flickers is in the difference, too.
         as_wide = spots.major_px[:, None] > _AS_WIDE * lights.major_px
@@ -217,7 +217,7 @@ class StaticBackground:
         known, _ = self._known(shift)
         rest = replace(lights, cov_px2=known.cov_px2, place_px2=known.place_px2, at_rest=known.at_rest)
         of_changed = np.column_stack([self.lights.found.uv_px, self.lights.half_px])[changed]
-        boxes = np.concatenate([self.unknown, of_changed])
+        boxes = np.concatenate([self.unknown, of_changed, hidden])
         if not len(boxes):
             return spots[apart], rest
         again = find_spots(picture, parameters, self.noise, boxes)
@@ -274,13 +274,14 @@ class StaticBackground:
         holes of the difference instead. regions: of `find_spots`. fit: as in `parts`.
         """
         fit = fit or self.shown.in_picture(picture)
-        return Detections.none() if fit is None else self._moving(picture, parameters, shift, fit, inverted, regions)
+        return Detections.none() if fit is None else self._moving(picture, parameters, shift, fit, inverted, regions)[0]
 
     def _moving(
         self, picture: Picture, parameters: DetectParameters, shift: TextureShift, fit: Shown,
         inverted: bool = False, regions: NDArray[np.float64] | None = None,
-    ) -> Detections:  # fmt: skip
-        """`spots_in`, with the result of `ShownLight.in_picture`."""
+    ) -> tuple[Detections, NDArray[np.float64]]:  # fmt: skip
+        """`spots_in`, with the result of `ShownLight.in_picture`; and boxes (m, 3) of what is in front of something
+        else, px."""
         light, rows, model = fit.light, fit.rows, self.model
         more, raised = np.zeros((2, len(picture)))
         if rows is not None:
@@ -306,10 +307,13 @@ class StaticBackground:
             np.minimum(row // sample[0], len(fit.clear) - 1),
             np.minimum(column // sample[1], fit.clear.shape[1] - 1),
         )
-        kept = ~self.blind[row, column] & fits_around(fit.clear, fit.left, spots, sample)
+        kept, fits = ~self.blind[row, column], fits_around(fit.clear, fit.left, spots, sample)
+        half_px = AROUND_SPOT[0] * spots.major_px + AROUND_SPOT[1]
+        hidden = np.column_stack([spots.uv_px, half_px])[kept & ~fits]
+        kept &= fits
         spots, row, column, sampled = spots[kept], row[kept], column[kept], (sampled[0][kept], sampled[1][kept])
         if not len(spots):
-            return spots
+            return spots, hidden
         gain = 1.0 if self.gain is None else self.gain[row, column] / 2.0**GAIN_BITS
         peak = spots.peak / (self.steps * gain)
         bright = self.smooth[sampled] + self.structure[row, column]
@@ -326,4 +330,4 @@ class StaticBackground:
         shifts = self._shifts_at(spots)
         spots = self._known(shift)[1].added_to(spots, self.noise, shifts)
         place = np.zeros(len(spots)) if spots.place_px2 is None else spots.place_px2
-        return replace(spots, place_px2=place + fixed)
+        return replace(spots, place_px2=place + fixed), hidden

@@ -40,6 +40,7 @@ from tracking.noise_estimation.texture import is_limited_by_texture
 from tracking.parameters import DetectParameters
 
 VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # used for the estimate: the end of a video cannot be read without all of it
+_SMALL_PX = 0.1  # sigma of the mean attitude of a camera: below it, that is no more than the error of a usual spot
 MOTION_PICTURES = 100  # whose mean attitude a camera that moves is taken to have been calibrated in
 VIDEO_FRAMES = 60  # at the start of a video from which its static background is made
 _BLANK = 3  # consecutive pictures without any point after which the noise model is checked
@@ -66,7 +67,7 @@ class CameraNoise:
     )  # in use; None before the first estimate if none is stated
     motion: CameraMotion | None = field(default=None, init=False)  # None: the camera does not move, or none is seen
     background: StaticBackground | None = field(default=None, init=False)  # for faint spots; None: not used
-    moved_px: float = field(default=0.0, init=False)  # between the first picture and the last, if too far to correct
+    moved_px: float = field(default=0.0, init=False)  # once or slowly; 0: not, or hardly
     kept: float = field(default=float("nan"), init=False)  # share of a picture from the one before; nan: not known
     interlaced: bool = field(default=False, init=False)  # even and odd rows show two instants
     wide: WideLights | None = field(default=None, init=False)  # None: sums of pixels have no background
@@ -109,6 +110,13 @@ class CameraNoise:
         """Whether the pictures show texture or objects that hide spots, from which a background may free them."""
         return self.model is not None and is_limited_by_texture(self.model)
 
+    def sees_motion(self, pictures: Sequence[Picture], parameters: DetectParameters) -> bool:
+        """Whether pictures spread over the recording show that the camera moves."""
+        if not pictures or self.optics is None or self.model is None:
+            return False
+        clips = saturation_of(self._with_saturation(parameters, pictures[0]), pictures[0])
+        return CameraMotion.at_first(pictures, self.optics, self.model, clips) is not None
+
     def make_background(
         self, pictures: Sequence[Picture], parameters: DetectParameters, call: Callable[..., Any] = _called
     ) -> None:
@@ -137,6 +145,8 @@ class CameraNoise:
         if self.motion is not None and pictures:
             self.motion = self.motion.with_mean_of(pictures, self.saturation_dn(pictures[0], parameters))
             if self.motion.is_slow:
+                if self.motion.mean_variance_px2 > _SMALL_PX**2:
+                    self.moved_px = self.motion.farthest_px
                 how, remedy = "once or slowly", "Find out when it was moved, and calibrate it again"
             else:
                 how, remedy = "from picture to picture", "Check its mount and the floor"
@@ -286,7 +296,7 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
     successive = [p for k in three if isinstance(p := shown[k], np.ndarray)]
     if noise.estimate is not None:
         noise.kept = kept_of_the_last(successive, noise.estimate.step_dn**2 / 12)
-    if noise.shows_structure:
+    if noise.shows_structure or noise.sees_motion(pictures, run.tracker.detect):
         if isinstance(source, PictureFiles):
             wanted = evenly_spread(source.numbers, PICTURES).tolist()
         else:

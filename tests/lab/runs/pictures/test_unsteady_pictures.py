@@ -42,6 +42,9 @@ ROOM = cv2.GaussianBlur(
     0.9,
 )
 SPLINE = ndimage.spline_filter(ROOM, order=3)
+# An even wall, in front of which the tops of three balls are.
+BALLS = [np.hypot(X - u, Y - v) < r for u, v, r in ((90, 380, 80), (360, 540, 90), (600, 430, 70))]
+WALL = ndimage.spline_filter(cv2.GaussianBlur(40.0 - 30.0 * np.any(BALLS, axis=0), (0, 0), 0.9), order=3)
 
 
 def turned(camera: Camera, by_rad: np.ndarray) -> Camera:
@@ -75,6 +78,7 @@ class Unsteady:
     walks: bool = False  # a person, through all pictures
     step_px: float = 0.0  # by which it is moved in a frame; it was calibrated before
     step_at: int = 0
+    wall: bool = False  # an even one, in place of a room
 
 
 def recording(folder: Path, **by_camera: Unsteady) -> tuple[Path, Path]:
@@ -104,7 +108,7 @@ def recording(folder: Path, **by_camera: Unsteady) -> tuple[Path, Path]:
                 origin, rays = now.rays(ends[::STEP, ::STEP])  # they vary smoothly
                 seen = np.moveaxis(camera.project(origin + 3.0 * rays)[..., ::-1] + MARGIN, -1, 0)
                 at_all = [RectBivariateSpline(*EVERY, x)(np.arange(SIZE[0]), np.arange(SIZE[1])) for x in seen]
-                room = ndimage.map_coordinates(SPLINE, at_all, order=3, prefilter=False)
+                room = ndimage.map_coordinates(WALL if its.wall else SPLINE, at_all, order=3, prefilter=False)
             picture = room * its.light(frame)
             at = spots[(spots.camera == name) & (spots.frame == frame)][["u_px", "v_px"]].dropna().to_numpy()
             start, towards = camera.rays(at)
@@ -153,10 +157,12 @@ def test_cameras_that_shake_are_named_and_their_poses_are_as_good_as_their_sigma
         assert any(note.startswith(f"{camera}: the camera moves by") for note in summary["notes"])
 
 
-@pytest.mark.parametrize("step_at", [4, FRAMES // 2, FRAMES - 6])
-def test_cameras_that_are_moved_during_a_recording_are_named_and_the_sigmas_contain_the_step(tmp_path, step_at):
+@pytest.mark.parametrize(
+    ("step_at", "wall"), [(4, False), (FRAMES // 2, False), (FRAMES - 6, False), (FRAMES // 2, True)]
+)
+def test_cameras_that_are_moved_during_a_recording_are_named_and_the_sigmas_contain_the_step(tmp_path, step_at, wall):
     """Which of the two attitudes is that of the calibration cannot be seen; the truth here is the first."""
-    moved = Unsteady(step_px=1.5, step_at=step_at)
+    moved = Unsteady(step_px=1.5, step_at=step_at, wall=wall)
     folder, truth = recording(tmp_path / "run", left=moved, right=moved)
     summary = processed(folder, tmp_path / "out")
     found = nees(tmp_path / "out", truth)
@@ -165,6 +171,11 @@ def test_cameras_that_are_moved_during_a_recording_are_named_and_the_sigmas_cont
     assert found.max() < 6.0
     for camera in summary["parameters"]["noise"]:
         assert any(note.startswith(f"{camera}: the camera moves by") and "once" in note for note in summary["notes"])
+    assert summary["verdict"]["status"] == "check"
+    named = {e["numbers"]["camera"]: e["numbers"] for e in summary["verdict"]["evidence"] if e["code"] == "BP-V19"}
+    assert {name: n["moved_px"] for name, n in named.items()} == pytest.approx(
+        dict.fromkeys(("left", "right"), 2.1), rel=0.15
+    )
 
 
 def test_cameras_that_are_moved_by_many_pixels_are_named(tmp_path):
@@ -230,6 +241,23 @@ def test_spots_are_found_in_front_of_rooms_whose_light_changes(tmp_path):
     assert found.mean() < 2.0
     spots = pd.read_csv(tmp_path / "out" / "spots.csv")
     assert (spots.groupby("camera").status.agg(lambda s: (s == "matched").mean()) > 0.97).all()
+
+
+def door_opens(frame: int) -> Any:
+    """A bright stripe of the room from the middle of the recording on."""
+    columns = np.arange(SIZE[1])
+    return 1 + 0.8 * (frame >= FRAMES // 2) * ((columns > 110) & (columns < 200))
+
+
+def test_spots_are_found_where_the_room_changes_during_the_recording(tmp_path):
+    """No background fits both halves of the recording there: the pictures themselves show the spots."""
+    folder, truth = recording(tmp_path / "run", left=Unsteady(light=door_opens), right=Unsteady(light=door_opens))
+    processed(folder, tmp_path / "out")
+    found = nees(tmp_path / "out", truth)
+    assert len(found) == FRAMES
+    assert found.mean() < 2.0
+    spots = pd.read_csv(tmp_path / "out" / "spots.csv")
+    assert (spots.groupby(["camera", "spot"]).status.agg(lambda s: (s == "matched").mean()) > 0.75).all()
 
 
 def test_light_in_bands_hides_no_spot_and_somebody_who_walks_past_hides_some_and_causes_no_wrong_pose(tmp_path):
