@@ -27,8 +27,9 @@ from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.json_text import bytes_of_file, plain_value, read_json
 from lab.packages import versions
+from lab.progress import heard
 from lab.runs.process import process_run
-from lab.runs.run_log import collected_lines
+from lab.runs.run_log import NAME
 
 
 def listed_runs(given: Sequence[str | os.PathLike[str]], lists: Sequence[str | os.PathLike[str]] = ()) -> list[Path]:
@@ -283,7 +284,8 @@ def perform(task: Task) -> TaskOutcome:
         return {**task.provenance, "fingerprint": value}
 
     code = ""
-    with collected_lines() as log:
+    log: list[str] = []
+    with heard(NAME, log.append):
         try:
             row, skipped = _processed(task, fingerprint), False
         except _AlreadyDone as done:
