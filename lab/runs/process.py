@@ -304,16 +304,9 @@ def write_tables(
     # Where the model check has tested the residuals, it has separated noise from faults.
     diagnosis = model_check.result.diagnosis
     noise_scale = None if diagnosis is not None else pipeline.tracker.noise_scale
-    cameras, names = pipeline.noise.items(), list(run.rig.cameras)
-    shown: dict[str, Any] = {
-        "mosaics": {name: noise.mosaic for name, noise in cameras if noise.mosaic},
-        "too_wide": {name: noise.too_wide_px for name, noise in cameras if noise.too_wide_px},
-        "moved": {name: noise.moved_px for name, noise in cameras if noise.moved_px},
-        "interlaced": [name for name, noise in cameras if noise.interlaced],
-        "kept": {name: noise.kept for name, noise in cameras},
-        "stretch": {names[camera]: found for camera, found in sampler.stretch_of_cameras(model.camera_of).items()},
-    }
-    verdict = quality.judge(statistics, model_check.findings, noise_scale, **shown)
+    names = list(run.rig.cameras)
+    stretch = {names[camera]: found for camera, found in sampler.stretch_of_cameras(model.camera_of).items()}
+    verdict = quality.judge(statistics, model_check.findings, noise_scale, pipeline.noise, stretch)
     explained = diagnosis is not None and diagnosis.is_random
     # Where a light is too wide a spot is missing, and no mistake explains that better.
     named = any(f.code == quality.TOO_WIDE for f in verdict.findings)
@@ -322,7 +315,7 @@ def write_tables(
     if mistakes:
         # The deviations of a rig with such a mistake are its consequences.
         others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings
-        verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, **shown)
+        verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, pipeline.noise, stretch)
     return statistics, model_check, verdict
 
 
