@@ -167,30 +167,29 @@ def _clock_numbers(run: Run) -> dict[str, Any]:
 
 
 def process_run(
-    run_folder: Path,
+    run_folder: Path | Run,
     out: Path,
     *,
     overrides: Mapping[str, Any] | None = None,
     causal: bool = False,
     progress: Progress | None = None,
-    more: Callable[[Run], Mapping[str, Any]] | None = None,
+    more: Mapping[str, Any] | None = None,
     rig_path: Path | None = None,
     full_hash: bool = False,
 ) -> Outcome[RunStatistics]:
-    """Process one run folder into the folder `out`: the tables, summary.json and report.html.
+    """Process one run folder, or a run of `ready_run`, into the folder `out`: tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. causal: the tables hold the causal estimates and
     nothing is smoothed; otherwise they hold the smoothed estimates, and attitude_causal.csv the causal ones. more:
-    additional content of summary.json; called with the run before its processing. rig_path: a rig.yaml in place of the
-    run's. full_hash: the fingerprints of the inputs cover every byte of large files, too. Raises BeamposeError: the run
-    cannot be processed (CalibrationError: its rig's calibration must not be used); `out` is then unchanged.
+    additional content of summary.json. rig_path: a rig.yaml in place of the run's. full_hash: the fingerprints of the
+    inputs cover every byte of large files, too. Raises BeamposeError: the run cannot be processed (CalibrationError:
+    its rig's calibration must not be used); `out` is then unchanged.
     """
     started = time.perf_counter()
-    run = ready_run(run_folder, overrides, rig_path)
-    added = {} if more is None else more(run)
+    run = run_folder if isinstance(run_folder, Run) else ready_run(run_folder, overrides, rig_path)
     with atomic_folder(out, may_replace=are_results) as work:
         return write_results(
-            Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress, more=lambda: added,
+            Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress, more=lambda: more or {},
             full_hash=full_hash,
         )  # fmt: skip
 
