@@ -110,8 +110,8 @@ def run_with_refined_rig(
         return found
     table = changes_of_numbers(found.result).table
     assert table is not None
-    content = {"line": found.line(), "report": str(folder.resolve() / "report.html"), "heads": table.heads}
-    content["rows"] = [[cell(value) for value in row] for row in table.rows]
+    rows = [[cell(value) for value in row] for row in table.rows]
+    content = {"line": found.line(), "report": str(folder.resolve() / "report.html"), "heads": table.heads, "rows": rows}
     return process_run(run_folder, out, rig_path=folder / RIG, more={**(more or {}), REFINED: content}, **options)
 
 
