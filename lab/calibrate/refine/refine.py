@@ -111,8 +111,9 @@ def run_with_refined_rig(
     table = changes_of_numbers(found.result).table
     assert table is not None
     rows = [[cell(value) for value in row] for row in table.rows]
-    content = {"line": found.line(), "report": str(folder.resolve() / "report.html"), "heads": table.heads, "rows": rows}
-    return process_run(run_folder, out, rig_path=folder / RIG, more={**(more or {}), REFINED: content}, **options)
+    content = {"line": found.line(), "report": str(folder.resolve() / "report.html"), "heads": table.heads}
+    block = {REFINED: {**content, "rows": rows}}
+    return process_run(run_folder, out, rig_path=folder / RIG, more={**(more or {}), **block}, **options)
 
 
 def _solve(
