@@ -56,11 +56,15 @@ def _for_compiled(
 
 def _tilt(xy: Array, J: Array, tau_x: Array, tau_y: Array) -> tuple[Array, Array]:
     """Distorted points (..., 2) and Jacobians (..., 2, 2) after the Scheimpflug tilt of the sensor, applied last."""
-    T = tilt_matrix(np.asarray(tau_x), np.asarray(tau_y))
+    out, _, D = _tilted(tilt_matrix(np.asarray(tau_x), np.asarray(tau_y)), xy)
+    return out, D @ J
+
+
+def _tilted(T: Array, xy: Array) -> tuple[Array, Array, Array]:
+    """Points (..., 2) after the homography T (..., 3, 3), their depths (..., 1), and the Jacobians (..., 2, 2)."""
     h = _turned(T, xy)
     out = h[..., :2] / h[..., 2:]
-    D = (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
-    return out, D @ J
+    return out, h[..., 2:], (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
 
 
 def coefficient_jacobian(xy: Array, coefficients: Array, fisheye: Bools | bool = False) -> Array:
@@ -72,13 +76,11 @@ def coefficient_jacobian(xy: Array, coefficients: Array, fisheye: Bools | bool =
         return J
     T, *dT = np.moveaxis(tilt_with_derivatives(tau_x, tau_y), -3, 0)
     bent = distort_all(*numbers)[0].reshape(*stack, 2)
-    h = _turned(T, bent)
-    out = h[..., :2] / h[..., 2:]
-    D = (T[..., :2, :2] - out[..., :, None] * T[..., 2:, :2]) / h[..., 2:, None]
+    out, depth, D = _tilted(T, bent)
     J[..., :12] = D @ J[..., :12]
     for column in (0, 1):
         dh = _turned(dT[column], bent)
-        by_tilt = (dh[..., :2] - out * dh[..., 2:]) / h[..., 2:]
+        by_tilt = (dh[..., :2] - out * dh[..., 2:]) / depth
         J[..., 12 + column] = np.where(wide[..., None], 0.0, by_tilt)
     return J
 

@@ -25,7 +25,6 @@ from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, 
 from tracking.drogue_circle.printed import printed_measurement
 from tracking.drogue_circle.rim_fit import RimFit, fit_rim, smooth_crop
 from tracking.noise import Picture
-from tracking.statuses import PoseStatus
 
 # The experiment of Zhou (2014), section 4, with rendered drogues: an approach from 10 m in three lights.
 #
@@ -56,16 +55,13 @@ class DrogueFrame:
 class LightFigures:
     """A tracker on the frames of one light."""
 
-    light: str
     frames: int
-    tracked: int  # measured or predicted, with a centre within a tenth of the radius
-    measured: int
-    errors_px: Array  # (m,) of the tracked frames
+    errors_px: Array  # (m,) of the tracked frames: measured or predicted, with a centre within a tenth of the radius
 
     @property
     def percent(self) -> float:
         """Share of tracked frames."""
-        return 100 * self.tracked / self.frames
+        return 100 * len(self.errors_px) / self.frames
 
 
 def approach(seed: int, light: str, frames: int, scale: int = 1) -> Iterator[DrogueFrame]:
@@ -140,7 +136,6 @@ def followed(seed: int, light: str, frames: int, forms: tuple[str, ...] = ("soun
     trackers = [CircleOptions(form=form, min_radius_px=10.0).tracker() for form in forms]
     own = [0] * len(forms)
     errors: list[list[float]] = [[] for _ in forms]
-    measured = [0] * len(forms)
     for drawn in approach(seed, light, frames):
         for i, tracker in enumerate(trackers):
             frame = tracker.step(drawn.picture)
@@ -151,12 +146,7 @@ def followed(seed: int, light: str, frames: int, forms: tuple[str, ...] = ("soun
                 own[i] = int(np.argmin(np.abs(drawn.circles - frame.state[:3]).sum(axis=1)))
             error = float(np.hypot(*(frame.state[:2] - drawn.circles[own[i], :2])))
             errors[i].append(error if error < TRACKED * drawn.circles[0, 2] else np.inf)
-            measured[i] += frame.status is PoseStatus.MEASURED
-    out = []
-    for own_errors, count in zip(errors, measured, strict=True):
-        good = np.array([e for e in own_errors if np.isfinite(e)])
-        out.append(LightFigures(light, len(own_errors), len(good), count, good))
-    return out
+    return [LightFigures(len(of_form), np.array([e for e in of_form if np.isfinite(e)])) for of_form in errors]
 
 
 # Pictures of a ring with known centre, partly behind a straight edge: what the detectors are compared on.

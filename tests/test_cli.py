@@ -582,7 +582,7 @@ def test_a_stopped_batch_reports_it(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(batch, "process_run", stop)
-    done = typed("batch", tmp_path / "a", "--out", tmp_path / "out")
+    done = typed("batch", points_run(tmp_path / "a"), "--out", tmp_path / "out")
     assert done.exit_code == 1
     assert done.stderr.strip() == "beampose: stopped"
 

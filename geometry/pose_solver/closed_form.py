@@ -102,21 +102,12 @@ def middle_spot(O: Array, A: Array, C: Array, alpha: float, beta: float, world_f
     alpha / (alpha + beta) of the measured angle AOC, then intersected with the screen. Source: ours.
     """
     OA, OC = normalised(A - O), normalised(C - O)
-    return _rotated_ray_on_screen(O, OA, OC, alpha / (alpha + beta), world_from_screen)
-
-
-def _rotated_ray_on_screen(O: Array, start: Array, towards: Array, share: Array | float, screen: Pose) -> Array:
-    """Intersection (..., 3), m, of a screen with the ray from O; nan if the ray points away from it.
-
-    The ray's direction is `start`, rotated by a share of the angle to `towards`; both are unit vectors (..., 3).
-    """
-    angle = _angle(start, towards)
-    across = normalised(towards - np.sum(start * towards, axis=-1)[..., None] * start)
-    turn = angle * share
-    ray = np.cos(turn)[..., None] * start + np.sin(turn)[..., None] * across
-    normal = screen.rotation[:, 2]
+    across = normalised(OC - np.sum(OA * OC, axis=-1)[..., None] * OA)
+    turn = _angle(OA, OC) * (alpha / (alpha + beta))
+    ray = np.cos(turn)[..., None] * OA + np.sin(turn)[..., None] * across
+    normal = world_from_screen.rotation[:, 2]
     facing = ray @ normal
-    height = (screen.translation - O) @ normal
+    height = (world_from_screen.translation - O) @ normal
     with np.errstate(invalid="ignore", divide="ignore"):
         t = height / facing
         ahead: Bools = np.asarray((t > 0) & np.isfinite(t))

@@ -18,6 +18,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
@@ -28,7 +29,7 @@ from lab.cycle_search import search_rarely
 from lab.errors import BeamposeError
 from lab.files.output.part_folder import remove_unfinished
 from lab.files.text.error_text import printable
-from lab.progress import Progress
+from lab.progress import Lines, Progress, heard
 
 _GRACE_S = 5.0  # for the regular end; Docker kills after 10 s, Slurm after 30 s
 
@@ -184,18 +185,16 @@ def show_line(text: str) -> None:
     click.echo(printable(text))
 
 
-class StderrHandler(logging.Handler):
-    """Shows log messages of the libraries below, such as that they compile, as lines on stderr."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        print(f"beampose: {record.getMessage()}", file=sys.stderr)  # not by click, which writes into a progress bar
+def _message(line: str) -> None:
+    """Shows a message of the libraries below, such as that they compile."""
+    print(f"beampose: {line}", file=sys.stderr)  # not by click, which writes into a progress bar
 
 
 def _show_log_on_a_terminal() -> None:
     """Shows log messages where a progress bar is shown. Elsewhere, any line on stderr indicates a problem."""
     logger = logging.getLogger("beampose")
     if sys.stderr.isatty() and not logger.handlers:
-        logger.addHandler(StderrHandler())
+        logger.addHandler(Lines(_message))
         logger.setLevel(logging.INFO)
 
 
@@ -391,11 +390,6 @@ verbose_option = click.option(
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="Show nothing but errors.")
 
 
-class _Lines(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        print(record.getMessage(), file=sys.stderr, flush=True)
-
-
 @contextlib.contextmanager
 def shown(name: str, *, verbose: bool, quiet: bool) -> Iterator[Callable[..., None] | None]:
     """The callback for the progress of a run; None without a progress bar.
@@ -408,14 +402,10 @@ def shown(name: str, *, verbose: bool, quiet: bool) -> Iterator[Callable[..., No
         with silenced():
             yield None
     elif verbose:
-        from lab.runs.run_log import LOGGER
+        from lab.runs.run_log import NAME
 
-        handler = _Lines()
-        LOGGER.addHandler(handler)
-        try:
+        with heard(NAME, partial(print, file=sys.stderr, flush=True)):
             yield None
-        finally:
-            LOGGER.removeHandler(handler)
     else:
         with progress_bar(name) as progress:
             yield progress
@@ -430,15 +420,14 @@ def check_verbosity(*, verbose: bool, quiet: bool) -> None:
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
     """Messages of the libraries, such as that they compile, are not shown on the terminal in this block."""
-    handlers = [h for h in logging.getLogger("beampose").handlers if isinstance(h, StderrHandler)]
-    before = [handler.level for handler in handlers]
+    handlers = [h for h in logging.getLogger("beampose").handlers if isinstance(h, Lines)]
     for handler in handlers:
         handler.setLevel(logging.ERROR)
     try:
         yield
     finally:
-        for handler, level in zip(handlers, before, strict=True):
-            handler.setLevel(level)
+        for handler in handlers:
+            handler.setLevel(logging.NOTSET)
 
 
 # The command as it was typed, for summary.json and the log.

@@ -85,7 +85,7 @@ def run(
     # Of the earlier results in this folder, with the option that makes it again.
     added = [(p, option) for name, option in _ADDED.items() for p in sorted(out.glob(name))]
     with shown(run_folder.name, verbose=verbose, quiet=quiet) as progress:
-        outcome = process(run_folder, out, progress=progress, more=lambda _: provenance(ctx), **options)
+        outcome = process(run_folder, out, progress=progress, more=provenance(ctx), **options)
     gone = "removed with the earlier results; make it again with `beampose report"
     conclude(outcome, quiet=quiet, notes=[f"{path}: {gone} {out} {option}`" for path, option in added])
 

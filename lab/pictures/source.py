@@ -169,7 +169,7 @@ def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureSour
             f"--camera: expected a name without control characters and without =, +, -, @ in front, got {camera!r}"
         )
     if len(given) == 1 and given[0].is_dir():
-        return _numbered(_pictures_in(given[0]), camera or name_of_path(given[0]))
+        return _numbered(pictures_in(given[0]), camera or name_of_path(given[0]))
     files = [file for path in given for file in _files_of(path)]
     files = list({file.resolve(): file for file in files}.values())
     others = [f for f in files if f.suffix.lower() not in PICTURE_SUFFIXES]
@@ -191,26 +191,32 @@ def open_inputs(given: Sequence[Path], camera: str | None = None) -> PictureSour
 def _files_of(path: Path) -> list[Path]:
     if path.is_dir():
         raise InputError(f"{path}: expected a folder alone, or files, got a folder among others; name one at a time")
+    return matching_files(path, _HINT)
+
+
+def matching_files(path: Path, expected: str, suffixes: tuple[str, ...] = ("",)) -> list[Path]:
+    """A file, or those with one of these suffixes that a pattern finds, sorted. Raises InputError: there is none."""
     if path.exists():
         return [path]
     if any(c in str(path) for c in "*?["):
-        matching = [Path(p) for p in sorted(glob.glob(str(path), recursive=True))]
+        matching = [Path(p) for p in sorted(glob.glob(str(path), recursive=True)) if p.lower().endswith(suffixes)]
         matching = [p for p in matching if p.is_file()]
         if not matching:
             raise InputError(f"{path}: no file matches this pattern")
         return matching
-    raise InputError(f"{path}: expected {_HINT}, found nothing; check the path")
+    raise InputError(f"{path}: expected {expected}, found nothing; check the path")
 
 
-def _pictures_in(folder: Path) -> list[Path]:
+def pictures_in(folder: Path, suffixes: tuple[str, ...] = PICTURE_SUFFIXES) -> list[Path]:
+    """The pictures in a folder, sorted; without hidden files. Raises InputError: there is none."""
     try:
         names = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from None
-    pictures = [p for p in names if p.suffix.lower() in PICTURE_SUFFIXES and p.is_file()]
+    pictures = [p for p in names if p.suffix.lower() in suffixes and p.is_file()]
     if pictures:
         return pictures
-    below = [p.name for p in names if p.is_dir() and any(q.suffix.lower() in PICTURE_SUFFIXES for q in p.iterdir())]
+    below = [p.name for p in names if p.is_dir() and any(q.suffix.lower() in suffixes for q in p.iterdir())]
     hint = f"; its folders {', '.join(below[:_SHOWN])} do: name one of them" if below else ""
     among = f" among {len(names)} files" if names and not below else ""
     raise InputError(

@@ -167,30 +167,29 @@ def _clock_numbers(run: Run) -> dict[str, Any]:
 
 
 def process_run(
-    run_folder: Path,
+    run_folder: Path | Run,
     out: Path,
     *,
     overrides: Mapping[str, Any] | None = None,
     causal: bool = False,
     progress: Progress | None = None,
-    more: Callable[[Run], Mapping[str, Any]] | None = None,
+    more: Mapping[str, Any] | None = None,
     rig_path: Path | None = None,
     full_hash: bool = False,
 ) -> Outcome[RunStatistics]:
-    """Process one run folder into the folder `out`: the tables, summary.json and report.html.
+    """Process one run folder, or a run of `ready_run`, into the folder `out`: tables, summary.json and report.html.
 
     overrides: tracker parameters that replace those of run.yaml. causal: the tables hold the causal estimates and
     nothing is smoothed; otherwise they hold the smoothed estimates, and attitude_causal.csv the causal ones. more:
-    additional content of summary.json; called with the run before its processing. rig_path: a rig.yaml in place of the
-    run's. full_hash: the fingerprints of the inputs cover every byte of large files, too. Raises BeamposeError: the run
-    cannot be processed (CalibrationError: its rig's calibration must not be used); `out` is then unchanged.
+    additional content of summary.json. rig_path: a rig.yaml in place of the run's. full_hash: the fingerprints of the
+    inputs cover every byte of large files, too. Raises BeamposeError: the run cannot be processed (CalibrationError:
+    its rig's calibration must not be used); `out` is then unchanged.
     """
     started = time.perf_counter()
-    run = ready_run(run_folder, overrides, rig_path)
-    added = {} if more is None else more(run)
+    run = run_folder if isinstance(run_folder, Run) else ready_run(run_folder, overrides, rig_path)
     with atomic_folder(out, may_replace=are_results) as work:
         return write_results(
-            Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress, more=lambda: added,
+            Pipeline.of(run), work, Path(out), started, causal=causal, progress=progress, more=lambda: more or {},
             full_hash=full_hash,
         )  # fmt: skip
 
@@ -304,16 +303,9 @@ def write_tables(
     # Where the model check has tested the residuals, it has separated noise from faults.
     diagnosis = model_check.result.diagnosis
     noise_scale = None if diagnosis is not None else pipeline.tracker.noise_scale
-    cameras, names = pipeline.noise.items(), list(run.rig.cameras)
-    shown: dict[str, Any] = {
-        "mosaics": {name: noise.mosaic for name, noise in cameras if noise.mosaic},
-        "too_wide": {name: noise.too_wide_px for name, noise in cameras if noise.too_wide_px},
-        "moved": {name: noise.moved_px for name, noise in cameras if noise.moved_px},
-        "interlaced": [name for name, noise in cameras if noise.interlaced],
-        "kept": {name: noise.kept for name, noise in cameras},
-        "stretch": {names[camera]: found for camera, found in sampler.stretch_of_cameras(model.camera_of).items()},
-    }
-    verdict = quality.judge(statistics, model_check.findings, noise_scale, **shown)
+    names = list(run.rig.cameras)
+    stretch = {names[camera]: found for camera, found in sampler.stretch_of_cameras(model.camera_of).items()}
+    verdict = quality.judge(statistics, model_check.findings, noise_scale, pipeline.noise, stretch)
     explained = diagnosis is not None and diagnosis.is_random
     # Where a light is too wide a spot is missing, and no mistake explains that better.
     named = any(f.code == quality.TOO_WIDE for f in verdict.findings)
@@ -322,7 +314,7 @@ def write_tables(
     if mistakes:
         # The deviations of a rig with such a mistake are its consequences.
         others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings
-        verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, **shown)
+        verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, pipeline.noise, stretch)
     return statistics, model_check, verdict
 
 

@@ -15,7 +15,8 @@ from lab.findings.finding import Verdict
 from lab.progress import Progress
 
 FILE = "run.log"
-LOGGER = logging.getLogger("beampose.run")  # `--verbose` shows its lines while the run is processed
+NAME = "beampose.run"
+LOGGER = logging.getLogger(NAME)  # `--verbose` shows its lines while the run is processed
 LOGGER.propagate = False
 LOGGER.setLevel(logging.INFO)
 LOGGER.addHandler(logging.NullHandler())  # otherwise logging prints warnings where nobody listens
@@ -89,24 +90,3 @@ def listening() -> Iterator[RunLog]:
     finally:
         _LIBRARIES.removeHandler(log)
         _LIBRARIES.setLevel(level)
-
-
-class _Collector(logging.Handler):
-    def __init__(self, lines: list[str]) -> None:
-        super().__init__(logging.INFO)
-        self._lines = lines
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._lines.append(record.getMessage())
-
-
-@contextlib.contextmanager
-def collected_lines() -> Iterator[list[str]]:
-    """A list that gets the lines of a run's log as they come: also of a run that ends with an error."""
-    lines: list[str] = []
-    handler = _Collector(lines)
-    LOGGER.addHandler(handler)
-    try:
-        yield lines
-    finally:
-        LOGGER.removeHandler(handler)

@@ -157,7 +157,7 @@ def _paths(scene: Scene, views: NDArray[np.int64], k: int, covariance_px2: Array
     model = scene.model.subset(views)
 
     def at(since: Array) -> Array:
-        if not scene.scenario.clocks:
+        if np.all(scene.exposed_s[k, views] == scene.t_s[k]):
             return model.project(scene.motion.pose(float(scene.t_s[k]) + since))[0]
         times = scene.exposed_s[k, views] + since[:, None]  # (m, n)
         every = model.project(scene.motion.pose(times))[0]  # (m, n, n, 2)

@@ -33,17 +33,13 @@ def scaled(rig: Rig, scale: float) -> Rig:
         matrix[:2] *= scale
         matrix[:2, 2] += 0.5 * scale - 0.5
         width, height = (round(n * scale) for n in c.image_size_px)
-        cameras[name] = Camera(name, c.screen, (width, height), matrix, c.distortion, c.camera_from_world, c.noise)
-    return Rig(rig.screens, cameras, rig.beams, rig.spots)
+        cameras[name] = replace(c, image_size_px=(width, height), matrix=matrix)
+    return replace(rig, cameras=cameras)
 
 
 def with_noise(rig: Rig, noise: SensorNoise) -> Rig:
     """The rig with this sensor noise in every camera."""
-    cameras = {
-        n: Camera(n, c.screen, c.image_size_px, c.matrix, c.distortion, c.camera_from_world, noise)
-        for n, c in rig.cameras.items()
-    }
-    return Rig(rig.screens, cameras, rig.beams, rig.spots)
+    return replace(rig, cameras={n: replace(c, noise=noise) for n, c in rig.cameras.items()})
 
 
 def lab_camera(name: str, screen: str, position_m: Sequence[float], target_m: Sequence[float]) -> Camera:
@@ -102,14 +98,13 @@ def unequal_fan() -> Rig:
 
 def two_cameras_per_screen() -> Rig:
     """As `fan`, each screen observed by two cameras from different sides: twelve views of six spots."""
-    rig = fan()
     cameras = {
         "left-a": lab_camera("left-a", "left", (1.6, 0.6, 1.5), (-2.5, 0.35, 0.0)),
         "left-b": lab_camera("left-b", "left", (1.2, -1.5, 1.3), (-2.5, 0.0, 0.0)),
         "right-a": lab_camera("right-a", "right", (-1.6, -0.6, 1.5), (2.5, -0.35, 0.0)),
         "right-b": lab_camera("right-b", "right", (-1.2, 1.5, 1.3), (2.5, 0.0, 0.0)),
     }
-    return Rig(rig.screens, cameras, rig.beams, rig.spots)
+    return replace(fan(), cameras=cameras)
 
 
 def four_skew_beams() -> Rig:

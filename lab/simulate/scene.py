@@ -18,7 +18,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.errors import InputError
 from lab.files.text.error_text import require_one_of
-from lab.simulate.scenarios import RIGS, SCENARIOS, AnyMotion, Scenario, scaled, with_noise
+from lab.simulate.scenarios import RIGS, SCENARIOS, AnyMotion, PictureTiming, Scenario, scaled, with_noise
 
 # Every random number comes from a generator seeded by (seed, purpose, frame, ...): frame 7 is the same in a recording
 # of ten frames and of a thousand, and the clutter does not depend on the noise.
@@ -98,7 +98,7 @@ def compose(
     frame = np.arange(count)
     t_s = frame / scenario.frame_rate_hz
     poses = motion.pose(t_s)
-    uv, exposed_s = _exposed(scenario, model, motion, t_s, model.project(poses)[0])
+    uv, exposed_s = _exposed(scenario, rig, model, motion, t_s, model.project(poses)[0])
     bend_frames = np.floor(motion.bends_s(float(t_s[-1]) + 1.0) * scenario.frame_rate_hz + 1e-6).astype(np.int64)
     turned = np.isin(frame, bend_frames + 1)
     occluded, clutter_points = _occlusions_and_clutter(scenario, model, uv, bend_frames, seed)
@@ -109,20 +109,27 @@ def compose(
     )  # fmt: skip
 
 
-def _exposed(scenario: Scenario, model: SpotModel, motion: AnyMotion, t_s: Array, uv_px: Array) -> tuple[Array, Array]:
+def _exposed(
+    scenario: Scenario, rig: Rig, model: SpotModel, motion: AnyMotion, t_s: Array, uv_px: Array
+) -> tuple[Array, Array]:
     """Pixels (T, n, 2) of the spots when their pictures, or the rows of these, are exposed; and those times (T, n), s.
 
     uv_px (T, n, 2): at the times t_s (T,) of the frames.
     """
     exposed_s = np.repeat(t_s[:, None], len(model), axis=1)
     uv_px = uv_px.copy()
-    for timing in scenario.clocks:
-        late_s = timing.late_frames / scenario.frame_rate_hz
-        for view in np.flatnonzero(model.camera_of == model.camera_names.index(timing.camera)).tolist():
+    clocks = {timing.camera: timing for timing in scenario.clocks}  # added to those of the rig
+    for k, camera in enumerate(rig.cameras.values()):
+        timing = clocks.get(camera.name, PictureTiming(camera.name))
+        late_s = camera.time_offset_s + timing.late_frames / scenario.frame_rate_hz
+        row_time_s = camera.row_time_s + timing.row_time_s
+        if late_s == 0.0 == row_time_s:
+            continue
+        for view in np.flatnonzero(model.camera_of == k).tolist():
             one, middle = model.subset(np.array([view])), (model.image_size_px[view, 1] - 1) / 2
             for _ in range(_ROW_STEPS):
                 row = np.clip(np.nan_to_num(uv_px[:, view, 1], nan=middle), -0.5, 2 * middle + 0.5)
-                exposed_s[:, view] = t_s + late_s + (row - middle) * timing.row_time_s
+                exposed_s[:, view] = t_s + late_s + (row - middle) * row_time_s
                 uv_px[:, view] = one.project(motion.pose(exposed_s[:, view]))[0][:, 0]
     return uv_px, exposed_s
 

@@ -102,7 +102,6 @@ def mean_of_frames(pixels: Array, covariance: Array) -> tuple[Array, Array]:
 MAX_NOMINAL_ERROR_RAD = np.deg2rad(1.0)
 MAX_NOMINAL_ERROR_M = 0.02
 Labelled = list[tuple[int, Array, Array]]  # view, pixel (2,), covariance (2, 2)
-_MEASURED = (SpotStatus.MATCHED, SpotStatus.TURNED)
 
 
 def spots_of_run(folder: Path, rig: Rig, known: StandPoses | None, world_from_stand: Pose | None) -> SpotRows:
@@ -191,13 +190,13 @@ def _labelled(
     else:
         for record in pipeline.records():
             t = record.tracked
-            yield record.frame, [(v, t.uv_px[v], t.cov_px2[v]) for v, s in enumerate(t.status) if s in _MEASURED]
+            yield record.frame, [(v, t.uv_px[v], t.cov_px2[v]) for v, s in enumerate(t.status) if s.measured]
 
 
 SPOTS = ("camera", "spot", "u_px", "v_px")
 DEFAULT_SPOT_SIGMA_PX = 0.1  # px, if the table states none: a laser spot on a matt screen, speckle included
 MAX_UNKNOWN_POSES = 200  # positions without a pose that are used: each adds six unknowns, more add little information
-_USED = ("matched", "turned")  # statuses in spots.csv that are measurements
+_USED = [status.value for status in SpotStatus if status.measured]  # in spots.csv
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@ Tables of board corners that another program found: mrcal's corners.vnl, or a CS
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import re
 from collections import Counter, deque
@@ -27,10 +26,11 @@ from lab.files.text.json_text import text_of_file
 from lab.number_format import format_number
 from lab.pictures import source
 from lab.pictures.picture_file import PICTURE_SUFFIXES, UNREADABLE, GreyPicture, MissingPicture, read_picture
-from lab.pictures.source import pictures, video_at
+from lab.pictures.source import matching_files, pictures, pictures_in, video_at
 from lab.progress import Progress
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm")
+_SUFFIXES, _EXPECTED = PICTURE_SUFFIXES + VIDEO_SUFFIXES, "a picture, a folder or a pattern"
 VIDEO_PICTURES = 120  # largest number of frames used of one video, evenly spaced: neighbouring frames differ little
 _MAX_NAMES = 3  # file names shown in an error message
 # Number of pictures without the board that get the thorough search, which takes seconds, while no picture has shown the
@@ -70,35 +70,13 @@ def load_photos(paths: Iterable[Path | str]) -> tuple[Path, ...]:
     Raises InputError: if a path matches no file, or no path is given.
     """
     found: list[Path] = []
-    for given in paths:
-        found += _files_of(Path(given))
+    for path in map(Path, paths):
+        files = pictures_in(path, _SUFFIXES) if path.is_dir() else matching_files(path, _EXPECTED, _SUFFIXES)
+        found += sorted(files, key=_natural)
     unique = tuple({path.resolve(): path for path in found}.values())
     if not unique:
         raise InputError("no pictures given; name picture files, a folder of them or a pattern such as shots/*.png")
     return unique
-
-
-def _files_of(path: Path) -> list[Path]:
-    if path.is_dir():
-        inside = sorted((p for p in path.iterdir() if _is_picture(p)), key=_natural)
-        if not inside:
-            below = [p.name for p in sorted(path.iterdir()) if p.is_dir() and any(map(_is_picture, p.iterdir()))]
-            hint = f"; give one of its folders with pictures: {', '.join(below[:_MAX_NAMES])}" if below else ""
-            raise InputError(f"{path}: the folder has no pictures ({', '.join(s[1:] for s in PICTURE_SUFFIXES)}){hint}")
-        return inside
-    if path.exists():
-        return [path]
-    if any(c in str(path) for c in "*?["):
-        matching = sorted((Path(p) for p in glob.glob(str(path), recursive=True)), key=_natural)
-        files = [p for p in matching if _is_picture(p)]
-        if not files:
-            raise InputError(f"{path}: no picture matches this pattern")
-        return files
-    raise InputError(f"{path}: expected a picture, a folder or a pattern, found no such file; check the path")
-
-
-def _is_picture(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() in PICTURE_SUFFIXES + VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
 def _natural(path: Path) -> tuple[str, list[tuple[int, str]]]:

@@ -6,7 +6,7 @@ residuals.csv: the residual of every spot that was used, with the rig as given a
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -97,7 +97,7 @@ def refine_rig(
 
 
 def run_with_refined_rig(
-    run_folder: Path, out: Path, *, more: Callable[[Run], Mapping[str, Any]] | None = None, **options: Any
+    run_folder: Path, out: Path, *, more: Mapping[str, Any] | None = None, **options: Any
 ) -> Outcome[Any]:
     """Refine the rig of a run by this run, into `OUT-refined`, and process the run with the result, into `out`.
 
@@ -110,13 +110,10 @@ def run_with_refined_rig(
         return found
     table = changes_of_numbers(found.result).table
     assert table is not None
+    rows = [[cell(value) for value in row] for row in table.rows]
     content = {"line": found.line(), "report": str(folder.resolve() / "report.html"), "heads": table.heads}
-
-    def with_changes(run: Run) -> dict[str, Any]:
-        rows = [[cell(value) for value in row] for row in table.rows]
-        return {**({} if more is None else more(run)), REFINED: {**content, "rows": rows}}
-
-    return process_run(run_folder, out, rig_path=folder / RIG, more=with_changes, **options)
+    block = {REFINED: {**content, "rows": rows}}
+    return process_run(run_folder, out, rig_path=folder / RIG, more={**(more or {}), **block}, **options)
 
 
 def _solve(

@@ -160,10 +160,6 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 
-class LockedError(Exception):
-    """Another process holds the lock. The message names it."""
-
-
 @contextmanager
 def folder_lock(target: Path, name: str) -> Iterator[bool]:
     """Holds the lock of the output folder `target`, an absolute path, during the block.
@@ -173,13 +169,7 @@ def folder_lock(target: Path, name: str) -> Iterator[bool]:
     be made.
     """
     path = target.parent / f".{target.name}.beampose-lock"
-    try:
-        file, held = _locked_file(path)
-    except LockedError as error:
-        raise InputError(
-            f"{name}: expected a folder that nothing else writes to, found one in use{error}; wait for its end, or"
-            " choose another --out"
-        ) from None
+    file, held = _locked_file(path, name)
     try:
         if not held:
             yield False
@@ -193,8 +183,8 @@ def folder_lock(target: Path, name: str) -> Iterator[bool]:
         _unlock(file)
 
 
-def _locked_file(path: Path) -> tuple[int, bool]:
-    """A lock file, opened, and whether it is locked. Raises LockedError, OSError."""
+def _locked_file(path: Path, name: str) -> tuple[int, bool]:
+    """A lock file, opened, and whether it is locked. name: of the folder. Raises InputError, OSError."""
     while True:
         file = _open(path)
         try:
@@ -202,7 +192,10 @@ def _locked_file(path: Path) -> tuple[int, bool]:
         except BlockingIOError:
             owner = _read_owner(file)
             os.close(file)
-            raise LockedError(owner) from None
+            raise InputError(
+                f"{name}: expected a folder that nothing else writes to, found one in use{owner}; wait for its end, or"
+                " choose another --out"
+            ) from None
         if not held or is_at(file, path):
             return file, held
         os.close(file)  # its holder has removed it: not the file that others will find

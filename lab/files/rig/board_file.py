@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,21 +42,12 @@ def save_board(board: Board, path: Path) -> None:
 
 def as_mapping(board: Board) -> dict[str, Any]:
     """The content of board.yaml as a plain mapping."""
-    content: dict[str, Any] = {"schema": SCHEMA}
-    if isinstance(board, Chessboard):
-        content |= {"kind": CHESSBOARD, "columns": board.columns, "rows": board.rows, "square_m": board.square_m}
-    elif isinstance(board, CircleGrid):
-        content |= {"kind": CIRCLES, "columns": board.columns, "rows": board.rows, "spacing_m": board.spacing_m}
-        content |= {"asymmetric": board.asymmetric}
-        if board.stated_diameter_m is not None:
-            content |= {"diameter_m": board.stated_diameter_m}
-    else:
-        content |= {"kind": CHARUCO, "columns": board.columns, "rows": board.rows, "square_m": board.square_m}
-        content |= {"marker_m": board.marker_m, "dictionary": board.dictionary}
-        content |= {"inverted": board.inverted, "legacy": board.legacy}
-    return content
+    kind = next(name for name, made in _KINDS.items() if isinstance(board, made))
+    values = {name.removeprefix("stated_"): value for name, value in asdict(board).items() if value is not None}
+    return {"schema": SCHEMA, "kind": kind, **values}
 
 
+_KINDS = {CHESSBOARD: Chessboard, CIRCLES: CircleGrid, CHARUCO: Charuco}
 _FIELDS = {  # kind: required fields, optional fields
     CHESSBOARD: ({"square_m"}, set()),
     CIRCLES: ({"spacing_m"}, {"asymmetric", "diameter_m"}),
@@ -92,17 +84,6 @@ class _BoardBlock(Block):
         return self
 
     def board(self) -> Board:
-        if self.kind == CHESSBOARD:
-            return Chessboard(self.columns, self.rows, self.square_m or 0.0)
-        if self.kind == CIRCLES:
-            asymmetric = bool(self.asymmetric)
-            return CircleGrid(self.columns, self.rows, self.spacing_m or 0.0, asymmetric, self.diameter_m)
-        return Charuco(
-            self.columns,
-            self.rows,
-            self.square_m or 0.0,
-            self.marker_m or 0.0,
-            self.dictionary or "",
-            bool(self.inverted),
-            bool(self.legacy),
-        )
+        given = {"stated_diameter_m" if n == "diameter_m" else n: v for n, v in self if v is not None}
+        del given["schema_"], given["kind"]
+        return _KINDS[self.kind](**given)

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, true_ranges
 from geometry.pose import Pose
 from lab.errors import InputError
 from lab.files.run.run_file import Run, load_run
@@ -108,6 +108,14 @@ class SpotGrid:
     def cameras(self) -> tuple[str, ...]:
         """The cameras, in order of first appearance in the file."""
         return tuple(dict.fromkeys(camera for camera, _ in self.views))
+
+    def views_of(self, camera: str) -> list[int]:
+        """Indices of the views of a camera."""
+        return [j for j, (c, _) in enumerate(self.views) if c == camera]
+
+    def without_picture(self, camera: str) -> list[tuple[int, int]]:
+        """First index and one past the last index of each run of frames without a usable picture of a camera."""
+        return true_ranges(np.any(self.has(SpotStatus.NO_IMAGE)[:, self.views_of(camera)], axis=1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from geometry.arrays import Array, Bools, Ints
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.error_text import describe_value, is_formula, near_name, printable_line, suggest_name
+from lab.files.text.json_text import bytes_of_file
 
 MAX_COORDINATE_M = (
     10_000.0  # m from the origin: coordinates of a national grid must be transformed to a local frame first
@@ -113,9 +114,7 @@ def read_table(path: Path, required: Iterable[str], optional: Iterable[str] = ()
 def _content(path: Path, required: Sequence[str], damaged: bool) -> bytes:
     """The bytes of a table, UTF-8 text with a line or more. Raises InputError."""
     try:
-        if not (path.is_file() or path.is_dir()) and path.exists():
-            raise InputError(f"{path}: expected a table, found a pipe or a device; save the table as a file")
-        data = path.read_bytes()
+        data = bytes_of_file(path)
     except FileNotFoundError:
         raise InputError(f"{path}: expected a table with columns {','.join(required)}, found no file") from None
     except IsADirectoryError:

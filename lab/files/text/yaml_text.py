@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -15,6 +14,7 @@ import yaml
 
 from lab.errors import InputError
 from lab.files.text.atomic_write import atomic_write_text
+from lab.files.text.json_text import bytes_of_file
 
 # The YAML loader: core types of YAML 1.2, keys as written, no repeated key, and limits on what a file may hold.
 
@@ -196,12 +196,9 @@ MAX_FILE_BYTES = 64 << 20  # our largest files, rigs with a joint covariance, ha
 def read_text(path: Path) -> str:
     """The text of a UTF-8 file of at most MAX_FILE_BYTES. Raises InputError, in one line."""
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
-            raise InputError(f"{path}: expected a file, found a pipe or a device; save the text as a file")
-        if status.st_size > MAX_FILE_BYTES:
+        if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"{path}: expected a file of at most {MAX_FILE_BYTES >> 20} MB, found a larger one")
-        return path.read_bytes().decode("utf-8")
+        return bytes_of_file(path).decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: expected UTF-8 text, got an invalid byte at position {error.start}; save it as UTF-8"

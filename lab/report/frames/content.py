@@ -70,10 +70,6 @@ class ResultData:
             raise InputError(f"frame {frame}: expected a frame of the results, {frames[0]} to {frames[-1]}")
         return at
 
-    def views_of(self, camera: str) -> list[int]:
-        """Indices of the views of a camera."""
-        return [j for j, (c, _) in enumerate(self.spots.views) if c == camera]
-
 
 def read_result_data(results: Path, run_folder: Path | None = None) -> ResultData:
     """Read a results folder and what is there of its run folder (the one given, or the one that summary.json names).
@@ -131,7 +127,7 @@ def _sizes(spots: SpotGrid, run: Run | None) -> dict[str, tuple[int, int]]:
         return {name: run.rig.cameras[name].image_size_px for name in spots.cameras}
     out = {}
     for name in spots.cameras:
-        mine = [j for j, (c, _) in enumerate(spots.views) if c == name]
+        mine = spots.views_of(name)
         places = spots.uv_px[:, mine][spots.measured[:, mine]]
         far = np.ceil(places.max(axis=0) + MOST_OUTSIDE_PX) if len(places) else np.array([640.0, 480.0])
         out[name] = (int(far[0]), int(far[1]))
@@ -215,7 +211,7 @@ def frame_content(
         grey = picture if isinstance(picture, np.ndarray) else None
         reason = "" if grey is not None else _reason(picture)
         detections = _NONE if table is None else table.at(int(poses.frames[index]))
-        own = tuple(marks[j] for j in data.views_of(camera))
+        own = tuple(marks[j] for j in data.spots.views_of(camera))
         shown.append(CameraFrame(camera, data.sizes_px[camera], grey, reason, detections, own))
     return DrawnFrame(
         name=data.name,

@@ -44,11 +44,9 @@ def events(m: ReportData) -> list[ShownEvent]:
     cameras = m.spots.cameras
     out: list[ShownEvent] = []
     for camera in cameras:
-        own = [j for j, (c, _) in enumerate(m.spots.views) if c == camera]
-        missing = np.any(m.spots.has(SpotStatus.NO_IMAGE)[:, own], axis=1)
         out += [
             ShownEvent(a, camera, None, "no usable picture", _for_frames("no usable picture", a, b))
-            for a, b in true_ranges(missing)
+            for a, b in m.spots.without_picture(camera)
         ]
     for j in range(len(m.spots.views)):
         out += _spot_events(m, j)

@@ -275,7 +275,7 @@ _MOST_TURNS = 60  # marked turns of a spot
 
 def tracks_figure(m: ReportData, camera: str, zoom: ZoomData | None = None) -> str:
     """The tracks of a camera's spots in pixels with the edge of the picture; parts outside it are dashed."""
-    views = [j for j, (c, _) in enumerate(m.spots.views) if c == camera]
+    views = m.spots.views_of(camera)
     uv = m.spots.uv_px[:, views]
     if not np.isfinite(uv).any():
         return ""

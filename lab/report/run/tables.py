@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from geometry.arrays import Array, true_ranges
+from geometry.arrays import Array
 from geometry.rotations import ypr_jacobian
 from lab.number_format import format_angle, format_length, format_number, format_percent, median
 from lab.report.page import KeyFigure
@@ -242,11 +242,10 @@ def no_image_ranges(m: ReportData) -> list[tuple[str, str]]:
     """Camera, and its frame numbers without a usable picture as ranges."""
     out = []
     for camera in m.spots.cameras:
-        own = [j for j, (c, _) in enumerate(m.spots.views) if c == camera]
-        gone = np.any(m.spots.has(SpotStatus.NO_IMAGE)[:, own], axis=1)
         spans = m.summary.no_image.get(camera)
         if spans is None:
-            spans = [(int(m.spots.frames[a]), int(m.spots.frames[b - 1])) for a, b in true_ranges(gone)]
+            frames = m.spots.frames.tolist()
+            spans = [(frames[a], frames[b - 1]) for a, b in m.spots.without_picture(camera)]
         if spans:
             words = [str(a) if a == b else f"{a}\u2013{b}" for a, b in spans[:60]]
             more = f" … and {len(spans) - 60} more ranges" if len(spans) > 60 else ""

@@ -13,7 +13,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -27,8 +27,9 @@ from lab.files.run.run_file import Run
 from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.json_text import bytes_of_file, plain_value, read_json
 from lab.packages import versions
-from lab.runs.process import process_run
-from lab.runs.run_log import collected_lines
+from lab.progress import heard
+from lab.runs.process import process_run, ready_run
+from lab.runs.run_log import NAME
 
 
 def listed_runs(given: Sequence[str | os.PathLike[str]], lists: Sequence[str | os.PathLike[str]] = ()) -> list[Path]:
@@ -266,45 +267,33 @@ class TaskOutcome:
     log: tuple[str, ...] = ()  # the lines of the run's log
 
 
-class _AlreadyDone(Exception):  # noqa: N818 - ends the processing, not an error
-    def __init__(self, summary: Mapping[str, Any]) -> None:
-        super().__init__()
-        self.summary = summary
-
-
 def perform(task: Task) -> TaskOutcome:
     """Process a run, or use its earlier results. Any error becomes the row of the run."""
-
-    def fingerprint(run: Run) -> dict[str, Any]:
-        value = fingerprint_of(run, task.causal, task.full_hash)
-        summary = None if task.force else finished_summary(task.out / task.results, value)
-        if summary is not None:
-            raise _AlreadyDone(summary)
-        return {**task.provenance, "fingerprint": value}
-
-    code = ""
-    with collected_lines() as log:
+    log: list[str] = []
+    with heard(NAME, log.append):
         try:
-            row, skipped = _processed(task, fingerprint), False
-        except _AlreadyDone as done:
-            try:
-                row, skipped = _row(task, done.summary), True
-            except (KeyError, TypeError, AttributeError, ValueError):
-                damaged = "summary.json of the earlier results is damaged; delete the folder"
-                row, skipped, code = failed_row(task, damaged), False, RunError.code
+            outcome = _processed(task)
         except BeamposeError as error:
-            row, skipped, code = failed_row(task, str(error), error.exit_status), False, error.code
+            outcome = TaskOutcome(failed_row(task, str(error), error.exit_status), code=error.code)
         except Exception as error:  # unforeseen: it must not stop the other runs
             words, _, _ = unexpected_error(error, task.error_file).partition("\n")
-            row, skipped, code = failed_row(task, words), False, RunError.code
-    return TaskOutcome(row, skipped, code, tuple(log))
+            outcome = TaskOutcome(failed_row(task, words), code=RunError.code)
+    return dataclasses.replace(outcome, log=tuple(log))
 
 
-def _processed(task: Task, more: Callable[[Run], Mapping[str, Any]]) -> dict[str, Any]:
-    """The row of a processed run. Raises as `process_run`."""
-    started = time.perf_counter()
-    outcome = process_run(task.folder, task.out / task.results, overrides=task.overrides, causal=task.causal, more=more)
-    return {**_row(task, outcome.summary), "seconds": round(time.perf_counter() - started, 3)}
+def _processed(task: Task) -> TaskOutcome:
+    """The outcome of a run that can be processed, or has been. Raises as `process_run`."""
+    started, results = time.perf_counter(), task.out / task.results
+    run = ready_run(task.folder, task.overrides)
+    value = fingerprint_of(run, task.causal, task.full_hash)
+    earlier = None if task.force else finished_summary(results, value)
+    if earlier is not None:
+        try:
+            return TaskOutcome(_row(task, earlier), skipped=True)
+        except (KeyError, TypeError, AttributeError, ValueError):
+            raise RunError("summary.json of the earlier results is damaged; delete the folder") from None
+    done = process_run(run, results, causal=task.causal, more={**task.provenance, "fingerprint": value})
+    return TaskOutcome({**_row(task, done.summary), "seconds": round(time.perf_counter() - started, 3)})
 
 
 def failed_row(task: Task, message: str, exit_status: int = RunError.exit_status) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import permutations
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lab.findings.finding import Finding, Level, Verdict, finding, level_above, sentence, verdict, worst_first
 from lab.number_format import format_count, format_with_sigma
@@ -19,6 +19,9 @@ from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause
 from tracking.detection.detect import limit_that_admits
 from tracking.noise_estimation.averaging import LEAST_KEPT, OPEN_SHUTTER
 from tracking.statuses import SpotStatus
+
+if TYPE_CHECKING:
+    from lab.runs.frames.sensor_noise import CameraNoise
 
 # Share of the frames with enough visible spots: where the tracker missed more than half of them, it may not have
 # followed the vehicle in the others either. Frames with too few spots do not count.
@@ -50,21 +53,14 @@ def judge(
     statistics: RunStatistics,
     findings: Sequence[Finding] = (),
     noise_scale: float | None = None,
-    mosaics: Mapping[str, float] = MappingProxyType({}),
-    too_wide: Mapping[str, float] = MappingProxyType({}),
-    moved: Mapping[str, float] = MappingProxyType({}),
-    interlaced: Sequence[str] = (),
-    kept: Mapping[str, float] = MappingProxyType({}),
+    noise: Mapping[str, CameraNoise] = MappingProxyType({}),
     stretch: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> Verdict:
     """The verdict on a run.
 
     findings: of the model check (lab.runs.model_check.check.check_model). noise_scale: ratio of the residuals to the
-    detections' sigmas; None where the model check has tested that. mosaics: contrast of the colour mosaic by camera, of
-    cameras whose pictures show one. too_wide: sigma, px, of a light that detect.max_sigma_px excludes, by camera.
-    moved: px, by how much what stands still in the pictures of a camera has moved, by camera. interlaced: cameras with
-    such pictures. kept, stretch: what the noise and the spots of a camera say about averages of successive pictures
-    (tracking.noise_estimation.averaging).
+    detections' sigmas; None where the model check has tested that. noise: what pictures show besides spots, by camera.
+    stretch: how much longer spots are along their motion, by camera (tracking.noise_estimation.averaging).
     """
     if statistics.frames == 0:
         return _of([finding("BP-V01", Level.FAIL, "there is no frame at all")])
@@ -74,10 +70,11 @@ def judge(
     # A mistake of the set-up explains why nothing was found, or why the prior does not fit, and a colour mosaic why the
     # residuals do not fit the rig, and a light that is too wide why a spot is not found: they come first.
     found = [f for f in given if f.code == _SET_UP]
-    found += _mosaics(mosaics, verdict(given))
-    found += _too_wide(too_wide, statistics)
-    found += _moved(moved) + _averaging(kept, stretch)
-    for name in interlaced:
+    found += _mosaics({name: own.mosaic for name, own in noise.items() if own.mosaic}, verdict(given))
+    found += _too_wide({name: own.too_wide_px for name, own in noise.items() if own.too_wide_px}, statistics)
+    found += _moved({name: own.moved_px for name, own in noise.items() if own.moved_px})
+    found += _averaging({name: own.kept for name, own in noise.items()}, stretch)
+    for name in (name for name, own in noise.items() if own.interlaced):
         what = f"even and odd rows of the pictures of camera {name} show the moving spots at two places: interlaced"
         found.append(finding("BP-V23", Level.WARN, what, numbers={"camera": name}))
     found += _measured(statistics)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import datetime
 import json
+import re
 
 import cv2
 import numpy as np
@@ -105,6 +106,12 @@ def test_the_line_and_the_report_agree_on_the_verdict(left):
     for words in ("WARN", "Selection of the lens model", "two halves", "left01.jpg"):
         assert words in html
     assert "http://" not in html.replace("http://www.w3.org", "")
+
+
+def test_the_report_states_the_sigma_of_the_focal_length_also_as_a_share_of_it(left):
+    html = (left.out / "report.html").read_text(encoding="utf-8")
+    value, sigma, share = re.search(r"focal length fx.*?([\d.]+) ± ([\d.]+) px.*?([\d.]+)%", html, re.DOTALL).groups()
+    assert float(share) == pytest.approx(100 * float(sigma) / float(value), abs=0.02)
 
 
 def test_the_same_photographs_give_the_same_file_again(left, tmp_path):

@@ -95,9 +95,9 @@ def test_pictures_of_another_size_than_most_are_named_and_left_out(tmp_path, pic
 def test_a_path_without_pictures_is_refused_with_the_reason(tmp_path):
     for given, words in (
         ([], "no pictures given"),
-        ([tmp_path], "has no pictures"),
-        ([tmp_path / "x.png"], "found no such file; check the path"),
-        ([tmp_path / "*.png"], "no picture matches"),
+        ([tmp_path], "holds no pictures"),
+        ([tmp_path / "x.png"], "found nothing; check the path"),
+        ([tmp_path / "*.png"], "no file matches"),
     ):
         with pytest.raises(InputError, match=words):
             load_photos(given)

@@ -63,6 +63,15 @@ def test_good_measurements_pass_and_the_line_states_the_uncertainty(outcome):
     assert sorted(p.name for p in outcome.out.iterdir()) == ["report.html", "residuals.csv", "rig.yaml", "summary.json"]
 
 
+def test_steps_that_find_nothing_wrong_are_not_listed_beside_the_joint_adjustment(outcome):
+    """Each source of the rig is judged once: a second line about the same residuals would count them twice."""
+    words = [f.what for f in outcome.findings]
+    for source in ("spots: ", "pixels of dots: ", "survey: "):
+        assert sum(w.startswith(source) for w in words) == 1
+    assert not [w for w in words if w.startswith("the residuals are consistent")]
+    assert len({f.code for f in outcome.findings if f.code}) == 2  # near_m, and what one frame gives
+
+
 def test_the_rig_file_states_date_expiry_and_verdict(outcome, project, tmp_path):
     state = load_rig_file(outcome.out / "rig.yaml").calibration
     assert (state.date, state.verdict, state.reasons, state.valid_until) == (DAY, "PASS", (), None)

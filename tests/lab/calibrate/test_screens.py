@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import datetime
 import os
+import re
 import sys
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from calibration.boards.board_types import Charuco, parse
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from lab.calibrate.screens.screen import DOT_COLUMNS, RESIDUAL_COLUMNS, calibrate_screen
+from lab.calibrate.screens.screen_page import camera_covariance
 from lab.errors import CalibrationError, InputError
 from lab.files.project.point_files import read_point_cloud
 from lab.files.rig.camera_file import CameraFile, load_camera, save_camera
@@ -123,6 +125,19 @@ def test_the_report_shows_screens_pixels_and_the_lab(good):
     for words in ("bay 3", "Screen left", "flat", "Cameras, screens and control points", "Correlations", "survey.csv"):
         assert words in text
     assert len(text) < 2_000_000
+
+
+def test_the_report_states_the_sigma_of_a_cameras_place_in_millimetres(good):
+    """By ten thousand draws of its pose from its covariance: the mean over the axes of their spread."""
+    out, outcome = good
+    text = (out / "report.html").read_text()
+    for name, camera in outcome.result.fit.rig.cameras.items():
+        chol = np.linalg.cholesky(camera_covariance(outcome.result, name))
+        draws = camera.camera_from_world.plus(np.random.default_rng(1).normal(size=(10_000, 6)) @ chol.T)
+        spread = 1e3 * np.sqrt(np.mean(np.var(draws.inverse().translation, axis=0)))
+        row = re.search(rf"<tr><td[^>]*>{name}</td>(.*?)</tr>", text[text.index("sigma of position (mm)") :], re.DOTALL)
+        cells = re.findall(r"<td[^>]*>(.*?)</td>", row[1])
+        assert float(cells[2]) == pytest.approx(spread, rel=0.05)
 
 
 def test_an_earlier_result_is_replaced_but_no_other_folder(good, tmp_path):

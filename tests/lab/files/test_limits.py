@@ -108,9 +108,9 @@ def test_deep_brackets_on_the_command_line_are_refused_in_a_line():
 
 def test_a_pipe_in_place_of_a_file_is_refused_and_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InputError, match="found a pipe or a device"):
+    with pytest.raises(InputError, match="found a named pipe"):
         read_mapping(tmp_path / "pipe")
-    with pytest.raises(InputError, match="found a pipe or a device"):
+    with pytest.raises(InputError, match="found a named pipe"):
         read_table(tmp_path / "pipe", ("frame",))
     with pytest.raises(InputError, match="found a named pipe"):
         open_video(tmp_path / "pipe")

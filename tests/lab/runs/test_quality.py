@@ -7,6 +7,7 @@ from collections import Counter
 import pytest
 
 from lab.findings.finding import Finding, Level, Verdict, entries, finding
+from lab.runs.frames.sensor_noise import CameraNoise
 from lab.runs.verdict.quality import (
     GOOD_MEASURED,
     LEAST_DISPLACED,
@@ -17,6 +18,14 @@ from lab.runs.verdict.quality import (
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
 
 FRAMES = 1000
+
+
+def pictures_of(camera: str, **shown: float) -> dict[str, CameraNoise]:
+    """What the pictures of a camera show besides spots."""
+    noise = CameraNoise(camera)
+    for name, value in shown.items():
+        setattr(noise, name, value)
+    return {camera: noise}
 
 
 def ranges(*spans: tuple[int, int]) -> FrameRanges:
@@ -279,7 +288,7 @@ def test_the_exit_status_is_4_exactly_for_failures():
 
 
 def test_raw_pictures_of_a_colour_camera_are_a_point_to_check():
-    verdict = judge(statistics_of(), mosaics={"left": 0.2})
+    verdict = judge(statistics_of(), noise=pictures_of("left", mosaic=0.2))
     assert (verdict.status, kinds(verdict)[0]) == ("check", "colour_mosaic")
     assert "camera left" in verdict.texts[0]
     assert "20%" in verdict.texts[0]
@@ -305,7 +314,7 @@ def test_spots_that_are_longer_along_a_slow_motion_are_no_averages_where_the_noi
 
 def test_a_colour_mosaic_comes_before_the_misfit_that_it_explains():
     moved = Finding(Level.FAIL, "camera `left` may have moved", why="averaging does not help", code="BP-M01")
-    verdict = judge(statistics_of(), [moved], mosaics={"left": 0.5})
+    verdict = judge(statistics_of(), [moved], noise=pictures_of("left", mosaic=0.5))
     assert kinds(verdict) == ["colour_mosaic", "model"]
     assert "demosaicing" in verdict.of_frames(FRAMES, FRAMES)
     assert verdict.texts[1] == "camera `left` may have moved. Averaging does not help"
@@ -316,8 +325,8 @@ def test_a_light_that_is_too_wide_is_no_reason_where_another_camera_shows_nothin
     cameras = {"left": a_camera(points=0, empty=FRAMES, found=0), "right": a_camera(found=0)}
     nothing = statistics_of(0, {FrameCause.FEW_POINTS: FRAMES}, cameras)
     nothing.spot_status = {("left", "1"): Counter(), ("right", "2"): Counter()}
-    found = judge(nothing, too_wide={"right": 32.0})
+    found = judge(nothing, noise=pictures_of("right", too_wide_px=32.0))
     assert "BP-V21" not in {f.code for f in found.findings}
     assert "BP-V08" in {f.code for f in found.findings}
-    of_itself = judge(nothing, too_wide={"left": 32.0})  # its only light may be the spot
+    of_itself = judge(nothing, noise=pictures_of("left", too_wide_px=32.0))  # its only light may be the spot
     assert of_itself.findings[0].code == "BP-V21"

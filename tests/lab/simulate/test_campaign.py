@@ -61,6 +61,17 @@ def test_spots_and_dots_agree_with_the_truth_within_their_sigmas(folder):
     assert np.sqrt(np.mean(away**2)) == pytest.approx(0.054, rel=0.25)
 
 
+def test_the_dots_lie_on_their_screens_and_spread_over_them(folder):
+    truth, project = load_rig(folder / "truth" / "rig.yaml"), load_project(folder)
+    survey = read_survey(project.survey, project.screens)
+    for name, screen in truth.screens.items():
+        at = survey.xyz[[point.startswith(f"{name}-") for point in survey.names]]
+        x, y, z = screen.world_from_screen.inverse().apply(at).T
+        a, b, c = screen.bow
+        assert np.abs(z - (a * x * x + b * x * y + c * y * y)).max() < 1.5e-3  # m; the survey's error is 0.3 mm
+        assert min(np.ptp(x), np.ptp(y)) > 1.0
+
+
 def test_errors_of_the_recorded_stand_positions_agree_with_their_sigmas():
     c = draw_campaign(3, quality=CampaignQuality(positions=400))
     sigmas = np.repeat([c.quality.stand_m, np.deg2rad(c.quality.stand_deg)], 3)

@@ -29,6 +29,8 @@ def placed(seed: int) -> dict:
         content["screens"][name] = {"world_from_screen": quaternion_form(moved), "size_m": list(SIZE_M)}
     for name, camera in rig.cameras.items():
         content["cameras"][name]["camera_from_world"] = quaternion_form(camera.camera_from_world @ world.inverse())
+    for beam in content["target"]["beams"].values():  # past the origin of the body
+        beam["point_m"] = rng.uniform(-0.2, 0.2, 3).tolist()
     return content
 
 

@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from cli import main
-from tests.lab.results.compare.test_compare import write_results, write_tum
+from tests.lab.results.compare.test_compare import SIMPLE, write_results, write_tum
 from tests.tracking.comparison.motions import recordings
 
 
@@ -37,3 +37,15 @@ def test_a_comparison_without_out_prints_and_writes_nothing(tmp_path):
     assert done.exit_code == 0, done.output
     assert "chi-square per degree of freedom" in done.stdout
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_how_many_frames_are_within_their_limit_is_stated_against_a_reference_alone(tmp_path):
+    """The errors of two results can have the same causes, so that no share of them is to be expected."""
+    mine, theirs = recordings(1, truth=SIMPLE)
+    one, two = write_results(tmp_path / "one", mine), write_results(tmp_path / "two", mine)
+    reference = write_tum(tmp_path / "other.tum", theirs)
+    share = "of the frames within the 95 % limit"
+    assert share in CliRunner().invoke(main, ["compare", str(one), "--reference", str(reference)]).stdout
+    done = CliRunner().invoke(main, ["compare", str(one), str(two)])
+    assert done.exit_code == 0, done.output
+    assert share not in done.stdout

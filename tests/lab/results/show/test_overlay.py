@@ -81,7 +81,7 @@ def test_the_ring_of_a_measured_spot_has_the_colour_of_its_status(data):
         if 15 < boxes[i, cv2.CC_STAT_WIDTH] < 60 and boxes[i, cv2.CC_STAT_HEIGHT] > 15
     ]
     scale = layout.widths[0] / data.sizes_px["left"][0]
-    expected = (data.spots.uv_px[index, data.views_of("left")] + 0.5) * scale
+    expected = (data.spots.uv_px[index, data.spots.views_of("left")] + 0.5) * scale
     offsets = [min(np.subtract(r, e)[0] for r in [min(rings, key=lambda r, e=e: abs(r[0] - e[0]))]) for e in expected]
     # One shift of the whole picture on the sheet explains all of them: its left margin.
     assert np.ptp(offsets) < 1.5
@@ -109,7 +109,7 @@ def test_a_picture_of_any_size_can_be_drawn(data):
 def test_prediction_ellipses_have_the_scatter_of_the_predictions(data):
     content = content_of(data, 100)
     spots = data.spots
-    for mark, j in zip(content.cameras[0].marks, data.views_of("left"), strict=True):
+    for mark, j in zip(content.cameras[0].marks, data.spots.views_of("left"), strict=True):
         part = slice(50, 151)
         e = (spots.uv_px[part, j] - spots.predicted_px[part, j])[spots.measured[part, j]]
         if len(e) > 30:
@@ -195,7 +195,7 @@ def test_a_video_has_the_selected_frames_with_tails(fake):
 
 def test_a_tail_is_the_way_of_the_spot_until_now(data):
     content = content_of(data, 60, tail=20)
-    for mark, j in zip(content.cameras[0].marks, data.views_of("left"), strict=True):
+    for mark, j in zip(content.cameras[0].marks, data.spots.views_of("left"), strict=True):
         np.testing.assert_array_equal(mark.tail_px, data.spots.uv_px[40:61, j][::-1])
 
 

@@ -91,7 +91,7 @@ def test_any_error_of_a_run_becomes_its_row(tmp_path, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(module, "process_run", fail)
-    outcome = process_batch([tmp_path / "a"], tmp_path / "out")
+    outcome = process_batch([points_run(tmp_path / "a")], tmp_path / "out")
     (row,) = rows_of(outcome.table)
     assert row["exit_status"] == str(error.exit_status)
     assert row["message"] == str(error).replace("\n", " | ")
@@ -104,10 +104,10 @@ def test_the_table_is_written_after_every_run(tmp_path, monkeypatch):
     runs = [points_run(tmp_path / "a"), points_run(tmp_path / "b")]
     process_run = module.process_run
 
-    def stop_at_b(folder, *args, **kwargs):
-        if folder.name == "b":
+    def stop_at_b(run, *args, **kwargs):
+        if run.folder.name == "b":
             raise KeyboardInterrupt
-        return process_run(folder, *args, **kwargs)
+        return process_run(run, *args, **kwargs)
 
     monkeypatch.setattr(module, "process_run", stop_at_b)
     with pytest.raises(KeyboardInterrupt):

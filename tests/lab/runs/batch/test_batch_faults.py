@@ -37,10 +37,10 @@ def test_unforeseen_errors_are_rows_with_the_places_of_their_tracebacks(tmp_path
     for folder in bad:
         shutil.copytree(good, folder)
 
-    def process(folder, *args, **kwargs):
-        if folder in bad:
-            raise bad[folder]
-        return original(folder, *args, **kwargs)
+    def process(run, *args, **kwargs):
+        if run.folder in bad:
+            raise bad[run.folder]
+        return original(run, *args, **kwargs)
 
     monkeypatch.setattr(task, "process_run", process)
     outcome = process_batch([*bad, good], tmp_path / "out")

@@ -312,6 +312,22 @@ def test_a_round_bright_spot_looks_most_like_that_of_a_laser():
     assert np.all(likeness >= 0.0)
 
 
+def test_a_light_beside_a_spot_lowers_its_likeness_alike_on_either_side():
+    v, u = np.mgrid[:60, :61].astype(float)
+    light = 250 * np.exp(-0.5 * ((u - 30) ** 2 + (v - 30) ** 2) / 9)
+    image = np.clip(light + 10.0, 0, 255).astype(np.uint8)
+    beside = image.copy()
+    beside[20:40, 37:39] = 200
+    found = Detections(np.array([[30.0, 30.0]]), np.eye(2)[None], *(np.array([x]) for x in (1e4, 250.0, 3.0, 3.0, 0.0)))
+    alone, right, left, below = (
+        laser_likeness(np.ascontiguousarray(p), found, 255.0)[0]
+        for p in (image, beside, beside[:, ::-1], beside[:, :60].T)
+    )
+    assert right < 0.8 * alone
+    assert right == pytest.approx(left, rel=1e-6)
+    assert right == pytest.approx(below, rel=1e-6)
+
+
 def test_the_memory_for_figures_is_bounded():
     collection, n = SpotCollection(), MOST_KEPT // 8
     found = Detections(np.zeros((n, 2)), np.zeros((n, 2, 2)), *(np.zeros(n) for _ in range(5)))
