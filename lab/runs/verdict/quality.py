@@ -139,7 +139,7 @@ def _averaging(kept: Mapping[str, float], stretch: Mapping[str, tuple[float, flo
     shown, numbers = [], {}
     for name in dict.fromkeys((*kept, *stretch)):
         share, (growth, sigma) = kept.get(name, float("nan")), stretch.get(name, (0.0, float("inf")))
-        # Texture changes spots that move slowly alike in many pictures; where the noise shows no average, there is none.
+        # Texture deforms a slow spot in many pictures alike: where the noise shows no average, there is none.
         if growth - OPEN_SHUTTER > _SURE_SIGMAS * sigma and not share < LEAST_KEPT:
             sign = (
                 f"spots longer along their motion by {format_with_sigma(growth, sigma)} of its square, where a shutter"

@@ -308,7 +308,7 @@ def test_a_camera_that_moved_during_the_recording_is_a_point_to_check(frames, st
 @pytest.mark.parametrize(("kept", "status"), [(0.008, "pass"), (0.5, "check"), (float("nan"), "check")])
 def test_spots_that_are_longer_along_a_slow_motion_are_no_averages_where_the_noise_shows_none(kept, status):
     """Texture of the screen deforms the spot in successive pictures alike. nan: the noise shows nothing."""
-    verdict = judge(statistics_of(), kept={"left": kept}, stretch={"left": (2.1, 0.3)})
+    verdict = judge(statistics_of(), noise=pictures_of("left", kept=kept), stretch={"left": (2.1, 0.3)})
     assert verdict.status == status
 
 
