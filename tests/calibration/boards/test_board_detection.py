@@ -316,6 +316,17 @@ def test_markers_of_another_size_than_stated_are_measured():
     assert note.endswith("of a square, according to the text 0.49")
 
 
+@pytest.mark.parametrize("thorough", [True, False])
+@pytest.mark.parametrize("stated", [CHARUCO, CHARUCO + ":inverted"])
+def test_two_charuco_boards_of_the_same_kind_in_one_picture_are_named(stated, thorough):
+    _, photo = shot(CHARUCO)
+    found = find_board(np.hstack([photo.image, photo.image]), parse(stated), thorough)
+    assert isinstance(found, NotFound)
+    assert "two boards of this kind are in the picture; cover one" in found.reason
+    most_of_one = np.hstack([photo.image, photo.image[:, :190]])
+    assert isinstance(find_board(most_of_one, parse(stated), thorough), BoardView)
+
+
 @pytest.mark.parametrize("text", [CHARUCO, CHARUCO + ":inverted"])
 def test_a_mirrored_picture_of_a_charuco_board_is_rejected(text):
     board, photo = shot(text)
