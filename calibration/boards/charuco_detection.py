@@ -10,15 +10,14 @@ import numpy as np
 from calibration.boards import corner_refinement
 from calibration.boards.board_types import DICTIONARIES, Charuco, dictionary_size
 from calibration.boards.board_view import (
-    BLUR_LIMIT,
     QUICK_SEARCH_FAILED,
     BoardView,
     GreyImage,
     NotFound,
+    if_sharp,
     low_contrast,
     scaled,
     scales,
-    too_blurred,
 )
 from calibration.boards.grid_shape import straightened
 from geometry.arrays import Array, Ints
@@ -226,10 +225,8 @@ def _corners(image: GreyImage, board: Charuco, markers: Markers, notes: tuple[st
             " mostly hidden or outside the picture, too far away, blurred, or absent"
         )
     apart = corner_refinement.spacing(fine.pixels)
-    if fine.blur_px > BLUR_LIMIT * apart:
-        return too_blurred(fine.blur_px, apart)
     pixels, sigmas = fine.pixels.reshape(-1, 2)[seen], fine.sigmas_px.ravel()[seen]
-    return BoardView(board.ids[seen], pixels, apart, fine.blur_px, notes, sigmas_px=sigmas)
+    return if_sharp(BoardView(board.ids[seen], pixels, apart, fine.blur_px, notes, sigmas_px=sigmas))
 
 
 def _mirrored(image: GreyImage, board: Charuco, seen: int) -> NotFound | None:

@@ -18,16 +18,15 @@ from scipy.special import erf
 from calibration.boards import corner_refinement
 from calibration.boards.board_types import CircleGrid
 from calibration.boards.board_view import (
-    BLUR_LIMIT,
     QUICK_SEARCH_FAILED,
     BoardView,
     GreyImage,
     NotFound,
     at_full_size,
+    if_sharp,
     low_contrast,
     scaled,
     scales,
-    too_blurred,
 )
 from calibration.boards.chessboard_detection import upright
 from calibration.boards.corner_refinement import SINGLE, Pixelwise
@@ -160,10 +159,9 @@ def _measured(image: GreyImage, ordered: Array, blobs: Array, board: CircleGrid,
     pixels = ellipses.centres[order]
     blur = float(np.median(ellipses.blurs))
     apart = corner_refinement.spacing(pixels.reshape(ordered.shape))
-    if blur > BLUR_LIMIT * apart:
-        return too_blurred(blur, apart)
     notes = ("white circles on a black ground",) if light else ()
-    return BoardView(board.ids, pixels, apart, blur, notes, ellipses.areas[order], ellipses.sigmas_px[order])
+    areas, sigmas = ellipses.areas[order], ellipses.sigmas_px[order]
+    return if_sharp(BoardView(board.ids, pixels, apart, blur, notes, areas, sigmas))
 
 
 def _radii(centres: Array, by_board: Array, board: CircleGrid, blobs: Array) -> Array:
