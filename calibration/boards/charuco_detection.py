@@ -234,8 +234,7 @@ def _mirrored(image: GreyImage, board: Charuco, seen: int) -> NotFound | None:
 
     Some mirrored markers of 4x4 bits resemble others: of 37 to 49 markers up to 4 did in rendered photographs.
     """
-    for inverted in (board.inverted, not board.inverted):
-        shown = 255 - image if inverted else image
+    for shown in (image, 255 - image):
         flipped = np.ascontiguousarray(shown[:, ::-1])
         if len(find_markers(flipped, board.dictionary, board.markers).ids) >= max(3, 3 * seen):
             return NotFound("the picture is mirrored: switch off the mirroring of the camera or its software")
@@ -251,8 +250,7 @@ def _why_no_markers(image: GreyImage, board: Charuco) -> NotFound:
         return mirrored
     best, name, most = 0, "", 0
     small = scaled(image, next((s for s in scales(image) if s * max(image.shape) <= 1000), 1.0))
-    for inverted in (False, True):
-        shown = 255 - small if inverted else small
+    for shown in (small, 255 - small):
         for other in _LARGEST:
             found = find_markers(shown, other)
             if len(found.ids) > best:

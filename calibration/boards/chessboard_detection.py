@@ -53,9 +53,7 @@ def find_chessboard(image: GreyImage, board: Chessboard, thorough: bool = True) 
         return QUICK_SEARCH_FAILED
     largest = max(parts, key=lambda part: part.size, default=None)
     if largest is not None and sorted(largest.shape[:2]) == sorted((board.columns, board.rows)):
-        turned = largest.shape[:2] != (board.rows, board.columns)
-        found = _measured(image, np.swapaxes(largest, 0, 1) if turned else largest, board)
-        return found or NotFound(
+        return NotFound(  # `_grown` has tried to measure them
             "too blurred or noisy: the board was found, but its corners cannot be measured; focus, hold it still"
         )
     return _other_size(largest, board)

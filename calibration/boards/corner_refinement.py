@@ -253,11 +253,9 @@ def edge_distance(grid: Array, known: Bools) -> Array:
             h = g[::flip_r, ::flip_c]
             a, b = h[:-1, 1:] - h[:-1, :-1], h[1:, :-1] - h[:-1, :-1]
             area = np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-            height = np.full(out.shape, np.nan)
-            height[:-1, :-1] = area / np.maximum(
-                np.maximum(np.linalg.norm(a, axis=-1), np.linalg.norm(b, axis=-1)), 1e-9
-            )
-            out = np.fmin(out, height[::flip_r, ::flip_c])
+            longer = np.maximum(np.linalg.norm(a, axis=-1), np.linalg.norm(b, axis=-1))
+            beside = out[::flip_r, ::flip_c][:-1, :-1]
+            beside[:] = np.fmin(beside, area / np.maximum(longer, 1e-9))
     return out
 
 
