@@ -41,14 +41,16 @@ class NotFound:
 
 
 QUICK_SEARCH_FAILED = NotFound("no board found in a quick search")  # the cause was not determined
-BLUR_LIMIT = 0.2  # sigma of the edges in spacings: above it neighbouring corners merge
+_MOST_BLUR = 0.2  # sigma of the edges in spacings: above it neighbouring points merge
 
 
-def too_blurred(blur: float, apart: float) -> NotFound:
-    """The rejection of a blurred view. blur: sigma of its edges, px; apart: spacing of its points, px."""
+def if_sharp(view: BoardView) -> BoardView | NotFound:
+    """The view, or its rejection if it is blurred."""
+    if not view.blur_px > _MOST_BLUR * view.spacing_px:
+        return view
     return NotFound(
-        f"too blurred: edges have a width of {blur:.1f} px (1 sigma) with points {apart:.0f} px apart; focus,"
-        " hold the board still or use a shorter exposure"
+        f"too blurred: edges have a width of {view.blur_px:.1f} px (1 sigma) with points {view.spacing_px:.0f} px"
+        " apart; focus, hold the board still or use a shorter exposure"
     )
 
 

@@ -10,20 +10,20 @@ import numpy as np
 from calibration.boards import corner_refinement
 from calibration.boards.board_types import DICTIONARIES, Charuco, dictionary_size
 from calibration.boards.board_view import (
-    BLUR_LIMIT,
     QUICK_SEARCH_FAILED,
     BoardView,
     GreyImage,
     NotFound,
+    if_sharp,
     low_contrast,
     scaled,
     scales,
-    too_blurred,
 )
 from calibration.boards.grid_shape import straightened
 from geometry.arrays import Array, Ints
 
 _FEWEST = 6  # corners that do not all lie on one line: fewer do not contribute to the lens
+_FEWEST_REPEATED = 3  # markers that occur twice: so many by chance, where others resemble them
 _FITS = 0.7  # share of the markers at their places on the board; of a wrong board at most half are
 _LARGEST = (  # one dictionary of each family; the others consist of its first markers
     "DICT_4X4_1000",
@@ -45,6 +45,15 @@ class Markers:
 
     ids: Ints  # (n,)
     corners: Array  # (n, 4, 2), px, clockwise from the marker's top left
+    repeated: int = 0  # further numbers, which occur more than once in the picture
+
+    def two_boards(self) -> NotFound | None:
+        """The rejection of a picture in which most markers occur more than once."""
+        if self.repeated <= max(len(self.ids), _FEWEST_REPEATED):
+            return None
+        return NotFound(
+            f"{self.repeated} markers occur more than once: two boards of this kind are in the picture; cover one"
+        )
 
 
 def find_charuco(image: GreyImage, board: Charuco, thorough: bool = True) -> BoardView | NotFound:
@@ -54,10 +63,10 @@ def find_charuco(image: GreyImage, board: Charuco, thorough: bool = True) -> Boa
     """
     printed, markers = _as_printed(image, board)
     if len(markers.ids) == 0:
-        return _why_no_markers(image, board) if thorough else QUICK_SEARCH_FAILED
+        return markers.two_boards() or (_why_no_markers(image, board) if thorough else QUICK_SEARCH_FAILED)
     true, share = _fitting(board, markers, (image.shape[1], image.shape[0]))
     if isinstance(true, NotFound):
-        return _mirrored(image, board, len(markers.ids)) or true
+        return markers.two_boards() or _mirrored(image, board, len(markers.ids)) or true
     notes = []
     if printed != board.inverted:
         notes.append(
@@ -70,7 +79,8 @@ def find_charuco(image: GreyImage, board: Charuco, thorough: bool = True) -> Boa
             f"markers measure {share:.2f} of a square, according to the text {board.marker_m / board.square_m:.2f}"
         )
         true = replace(true, marker_m=share * true.square_m)
-    return _corners(255 - image if printed else image, true, markers, tuple(notes))
+    found = _corners(255 - image if printed else image, true, markers, tuple(notes))
+    return found if isinstance(found, BoardView) else markers.two_boards() or found
 
 
 def _as_printed(image: GreyImage, board: Charuco) -> tuple[bool, Markers]:
@@ -79,7 +89,7 @@ def _as_printed(image: GreyImage, board: Charuco) -> tuple[bool, Markers]:
     if len(stated.ids) >= 4:
         return board.inverted, stated
     other = find_markers(image if board.inverted else 255 - image, board.dictionary, board.markers)
-    if len(other.ids) > len(stated.ids):
+    if len(other.ids) + other.repeated > len(stated.ids) + stated.repeated:
         return not board.inverted, other
     return board.inverted, stated
 
@@ -97,8 +107,9 @@ def find_markers(image: GreyImage, dictionary: str, below: int | None = None) ->
     numbers = np.asarray(ids, dtype=np.int64).ravel()
     places = np.asarray(corners, dtype=float).reshape(-1, 4, 2)
     numbers, first, counts = np.unique(numbers, return_index=True, return_counts=True)
-    keep = (counts == 1) & (numbers < (below if below is not None else 1 << 30))
-    return Markers(numbers[keep], places[first[keep]])
+    known = numbers < (below if below is not None else 1 << 30)
+    keep = known & (counts == 1)
+    return Markers(numbers[keep], places[first[keep]], int(np.sum(known & (counts > 1))))
 
 
 def _fitting(
@@ -214,10 +225,8 @@ def _corners(image: GreyImage, board: Charuco, markers: Markers, notes: tuple[st
             " mostly hidden or outside the picture, too far away, blurred, or absent"
         )
     apart = corner_refinement.spacing(fine.pixels)
-    if fine.blur_px > BLUR_LIMIT * apart:
-        return too_blurred(fine.blur_px, apart)
     pixels, sigmas = fine.pixels.reshape(-1, 2)[seen], fine.sigmas_px.ravel()[seen]
-    return BoardView(board.ids[seen], pixels, apart, fine.blur_px, notes, sigmas_px=sigmas)
+    return if_sharp(BoardView(board.ids[seen], pixels, apart, fine.blur_px, notes, sigmas_px=sigmas))
 
 
 def _mirrored(image: GreyImage, board: Charuco, seen: int) -> NotFound | None:
@@ -225,8 +234,7 @@ def _mirrored(image: GreyImage, board: Charuco, seen: int) -> NotFound | None:
 
     Some mirrored markers of 4x4 bits resemble others: of 37 to 49 markers up to 4 did in rendered photographs.
     """
-    for inverted in (board.inverted, not board.inverted):
-        shown = 255 - image if inverted else image
+    for shown in (image, 255 - image):
         flipped = np.ascontiguousarray(shown[:, ::-1])
         if len(find_markers(flipped, board.dictionary, board.markers).ids) >= max(3, 3 * seen):
             return NotFound("the picture is mirrored: switch off the mirroring of the camera or its software")
@@ -242,8 +250,7 @@ def _why_no_markers(image: GreyImage, board: Charuco) -> NotFound:
         return mirrored
     best, name, most = 0, "", 0
     small = scaled(image, next((s for s in scales(image) if s * max(image.shape) <= 1000), 1.0))
-    for inverted in (False, True):
-        shown = 255 - small if inverted else small
+    for shown in (small, 255 - small):
         for other in _LARGEST:
             found = find_markers(shown, other)
             if len(found.ids) > best:

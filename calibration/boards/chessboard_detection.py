@@ -12,16 +12,15 @@ import numpy as np
 from calibration.boards import corner_refinement
 from calibration.boards.board_types import Chessboard
 from calibration.boards.board_view import (
-    BLUR_LIMIT,
     QUICK_SEARCH_FAILED,
     BoardView,
     GreyImage,
     NotFound,
     at_full_size,
+    if_sharp,
     low_contrast,
     scaled,
     scales,
-    too_blurred,
 )
 from calibration.boards.corner_refinement import Corners
 from geometry.arrays import Array
@@ -54,9 +53,7 @@ def find_chessboard(image: GreyImage, board: Chessboard, thorough: bool = True) 
         return QUICK_SEARCH_FAILED
     largest = max(parts, key=lambda part: part.size, default=None)
     if largest is not None and sorted(largest.shape[:2]) == sorted((board.columns, board.rows)):
-        turned = largest.shape[:2] != (board.rows, board.columns)
-        found = _measured(image, np.swapaxes(largest, 0, 1) if turned else largest, board)
-        return found or NotFound(
+        return NotFound(  # `_grown` has tried to measure them
             "too blurred or noisy: the board was found, but its corners cannot be measured; focus, hold it still"
         )
     return _other_size(largest, board)
@@ -194,9 +191,8 @@ def _checked(image: GreyImage, fine: Corners, board: Chessboard) -> BoardView | 
             " the inner corners along both sides again"
         )
     apart = corner_refinement.spacing(fine.pixels)
-    if fine.blur_px > BLUR_LIMIT * apart:
-        return too_blurred(fine.blur_px, apart)
-    return BoardView(board.ids, fine.pixels.reshape(-1, 2), apart, fine.blur_px, sigmas_px=fine.sigmas_px.ravel())
+    pixels, sigmas = fine.pixels.reshape(-1, 2), fine.sigmas_px.ravel()
+    return if_sharp(BoardView(board.ids, pixels, apart, fine.blur_px, sigmas_px=sigmas))
 
 
 def _grown(image: GreyImage, part: Array, rows: int, columns: int) -> Iterator[Corners]:

@@ -18,16 +18,15 @@ from scipy.special import erf
 from calibration.boards import corner_refinement
 from calibration.boards.board_types import CircleGrid
 from calibration.boards.board_view import (
-    BLUR_LIMIT,
     QUICK_SEARCH_FAILED,
     BoardView,
     GreyImage,
     NotFound,
     at_full_size,
+    if_sharp,
     low_contrast,
     scaled,
     scales,
-    too_blurred,
 )
 from calibration.boards.chessboard_detection import upright
 from calibration.boards.corner_refinement import SINGLE, Pixelwise
@@ -160,10 +159,9 @@ def _measured(image: GreyImage, ordered: Array, blobs: Array, board: CircleGrid,
     pixels = ellipses.centres[order]
     blur = float(np.median(ellipses.blurs))
     apart = corner_refinement.spacing(pixels.reshape(ordered.shape))
-    if blur > BLUR_LIMIT * apart:
-        return too_blurred(blur, apart)
     notes = ("white circles on a black ground",) if light else ()
-    return BoardView(board.ids, pixels, apart, blur, notes, ellipses.areas[order], ellipses.sigmas_px[order])
+    areas, sigmas = ellipses.areas[order], ellipses.sigmas_px[order]
+    return if_sharp(BoardView(board.ids, pixels, apart, blur, notes, areas, sigmas))
 
 
 def _radii(centres: Array, by_board: Array, board: CircleGrid, blobs: Array) -> Array:
@@ -314,12 +312,16 @@ def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Arra
         w = to_circle @ d
         length = np.maximum(np.hypot(w[:, 0], w[:, 1]), 1e-6)
         w /= length[:, None]
-        normal = to_circle @ w
-        n = np.maximum(np.hypot(normal[:, 0], normal[:, 1]), 1e-9)
         (p, q), (a, b) = np.moveaxis(w, 1, 0), (w * w).swapaxes(0, 1)
         cube = np.stack([p * (a - 3 * b), q * (3 * a - b)], axis=1)  # of the complex number p + i q
-        away = (length * (1 - (y[:, None, 5:7] @ cube)[:, 0]) - 1) / n
-        curved = np.linalg.det(to_circle)[:, None] ** 2 / n**3  # 1/px
+        # The outline is where the length times h is 1; h and its derivative by the angle give normal and curvature.
+        h = 1 - (y[:, None, 5:7] @ cube)[:, 0]
+        turn = 3 * (y[:, 5:6] * cube[:, 1] - y[:, 6:7] * cube[:, 0])
+        slant = np.stack([h * p - turn * q, h * q + turn * p], axis=1)
+        normal = to_circle @ slant
+        n = np.maximum(np.hypot(normal[:, 0], normal[:, 1]), 1e-9)
+        away = (length * h - 1) / n
+        curved = np.linalg.det(to_circle)[:, None] ** 2 * (9 - 8 * h) * (h / n) ** 3  # 1/px
         sigma = y[:, 7:]
         e = away / sigma + sigma * curved / 2  # blur displaces a curved edge towards its centre of curvature
         B[:, 1:3] = weight[:, None] * d / size[:, None, None]
@@ -328,7 +330,8 @@ def _fitted_outlines(image: GreyImage, centres: Array, shapes: Array, blur: Arra
         slope = np.swapaxes(linear[:, 3:], 1, 2).astype(SINGLE) @ B[:, :3]
         g = slope[:, 0] * SINGLE((2 / np.pi) ** 0.5) * np.exp(-e * e / 2) / (sigma * n)
         J[:, :2] = -g[:, None] * normal
-        J[:, 2], J[:, 3], J[:, 4] = g * p * d[:, 0], g * (p * d[:, 1] + q * d[:, 0]), g * q * d[:, 1]
+        (p, q), (a, b) = np.moveaxis(slant, 1, 0), np.moveaxis(d, 1, 0)
+        J[:, 2], J[:, 3], J[:, 4] = g * p * a, g * (p * b + q * a), g * q * b
         J[:, 5:7] = -(g * length)[:, None] * cube
         J[:, 7] = g * n * (curved * sigma / 2 - away / sigma)
         step, noise = corner_refinement.step_of(J, B, grey, linear)

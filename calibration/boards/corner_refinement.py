@@ -26,6 +26,7 @@ from geometry.arrays import Array, Bools
 _REACH = 0.4  # half of the window, in distances of the nearest parallel edge, which would be included from 0.5 on
 _MOST_PX = 12  # half of the window: a larger one includes more curved edges, and takes longer
 _OFF = 0.3  # distances of parallel edges from where the others of its row and column have it: it is not that corner
+_OPEN = 0.1  # of the same distances: sigma of a corner above which the fit has found something else
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
 _STEPS = 8  # of the fit of saddles: most need two to four
 _SMALL_PX = (0.01, 1e-3)  # last step in each of two passes: the curvature is first that of less accurate corners
@@ -87,9 +88,11 @@ def refined(
                 good = np.linalg.norm(found - out[i, j], axis=1) <= max(1.0, 0.25 * size)
                 out[i, j], look[i, j] = np.where(good[:, None], found, out[i, j]), seen
     out[np.linalg.norm(out - grid, axis=-1) > np.maximum(1.5, 0.75 * half)] = np.nan
-    out[_by_others(out)[1] > _OFF * height] = np.nan
+    sigmas = of_noise(noise)
+    with np.errstate(invalid="ignore"):
+        out[(_by_others(out)[1] > _OFF * height) | (sigmas > _OPEN * height)] = np.nan
     look = look[np.isfinite(out).all(axis=-1) & within]
-    return Corners(out, of_noise(noise), float(np.median(look[:, 2:])) if len(look) else np.nan)
+    return Corners(out, sigmas, float(np.median(look[:, 2:])) if len(look) else np.nan)
 
 
 def _saddles(
@@ -253,11 +256,9 @@ def edge_distance(grid: Array, known: Bools) -> Array:
             h = g[::flip_r, ::flip_c]
             a, b = h[:-1, 1:] - h[:-1, :-1], h[1:, :-1] - h[:-1, :-1]
             area = np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-            height = np.full(out.shape, np.nan)
-            height[:-1, :-1] = area / np.maximum(
-                np.maximum(np.linalg.norm(a, axis=-1), np.linalg.norm(b, axis=-1)), 1e-9
-            )
-            out = np.fmin(out, height[::flip_r, ::flip_c])
+            longer = np.maximum(np.linalg.norm(a, axis=-1), np.linalg.norm(b, axis=-1))
+            beside = out[::flip_r, ::flip_c][:-1, :-1]
+            beside[:] = np.fmin(beside, area / np.maximum(longer, 1e-9))
     return out
 
 

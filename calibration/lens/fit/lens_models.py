@@ -115,16 +115,10 @@ def folds_in_picture(numbers: Array, fisheye: bool, image_size_px: tuple[int, in
     """
     if fisheye and np.isinf(fold_r2(numbers, fisheye)):
         return False
-    width, height = image_size_px
-    along_x, along_y = np.linspace(-0.5, width - 0.5, _BORDER), np.linspace(-0.5, height - 0.5, _BORDER)
-    border = np.concatenate(
-        [
-            np.stack([along_x, np.full(_BORDER, -0.5)], axis=1),
-            np.stack([along_x, np.full(_BORDER, height - 0.5)], axis=1),
-            np.stack([np.full(_BORDER, -0.5), along_y], axis=1),
-            np.stack([np.full(_BORDER, width - 0.5), along_y], axis=1),
-        ]
-    )
+    u, v = np.meshgrid(*(np.linspace(-0.5, n - 0.5, _BORDER) for n in image_size_px))
+    inside = np.zeros(u.shape, dtype=bool)
+    inside[1:-1, 1:-1] = True
+    border = np.stack([u[~inside], v[~inside]], axis=1)
     return bool(np.isnan(undistorted(border, numbers, fisheye)).any())
 
 

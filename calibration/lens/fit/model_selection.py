@@ -24,12 +24,7 @@ from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_adjustment import BRIEF, ROUGH
 from calibration.lens.fit.lens_fit import CORNER_GATE, LensFit, fit, robust_fit
-from calibration.lens.fit.lens_models import (
-    LENS_MODELS,
-    LensModel,
-    folds_in_picture,
-    rational_of_fisheye,
-)
+from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, folds_in_picture, rational_of_fisheye
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom
 from calibration.lens.fit.projection_map import ProjectionMap, projection_map
 from calibration.lens.fit.view_equations import ViewEquations, scattered

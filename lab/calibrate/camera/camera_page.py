@@ -166,7 +166,7 @@ def _tilts(c: Intrinsics) -> Finding:
 def _coverage_finding(c: Intrinsics) -> Finding:
     gaps = c.coverage.gaps
     level = max(_level_below(c.coverage.filled, LIMITS.filled), Level.WARN if gaps else Level.PASS)
-    where = f"; none came near its {_listed(gaps)}" if gaps else ""
+    where = f"; none came near its {_listed(gaps)}, where directions are extrapolated" if gaps else ""
     return finding("BP-L15", level, f"Boards covered {c.coverage.filled:.0%} of the picture{where}.")
 
 

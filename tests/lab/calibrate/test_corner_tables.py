@@ -15,6 +15,7 @@ from lab.calibrate.camera.camera import CameraOptions, calibrate_camera, corner_
 from lab.calibrate.camera.photos import read_corner_table
 from lab.errors import InputError
 from tests.calibration.lens.lens_scenes import SIZE, Scene, board_points, photographs
+from tests.calibration.lens.random_lenses import corners_of, random_lens
 from tests.paths import DATA
 
 BOARD = "chessboard:9x6:30mm"
@@ -59,6 +60,18 @@ def test_a_camera_from_a_table_has_a_report_and_corners_that_can_be_read_again(t
     assert (first.out / "report.html").is_file()
     again = calibrate_camera([first.out / "corners.csv"], BOARD, tmp_path / "b", options)
     assert again.result.fit.lens[0] == pytest.approx(first.result.fit.lens[0], abs=0.01)
+
+
+def test_boards_in_one_corner_of_the_picture_fail_with_the_empty_sides_and_what_to_photograph(tmp_path):
+    table = corners_of(random_lens(1, "plain"), 1, views=40)
+    near = np.all(table.pixels < [560, 450], axis=1)
+    rows = [(f"v{v}", table.point[m := near & (table.view == v)], table.pixels[m]) for v in range(40)]
+    write_csv(tmp_path / "corners.csv", [row for row in rows if len(row[1]) > 20])
+    options = CameraOptions(image_size_px=table.image_size_px)
+    line = calibrate_camera([tmp_path / "corners.csv"], "chessboard:12x8:30mm", tmp_path / "out", options).line()
+    assert "FAIL" in line
+    assert "none came near its right side and bottom, where directions are extrapolated" in line
+    assert "Photograph next: 5 more, the board near the right side and bottom of the picture" in line
 
 
 def test_a_view_that_a_table_holds_twice_counts_once(tmp_path, views):
