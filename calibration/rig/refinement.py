@@ -300,6 +300,7 @@ class Refinement:
     moved: tuple[SuspectedFault, ...]  # parts that have changed by more than that
     lens_sigmas: Mapping[str, float]  # of focal lengths of which nothing is stated, relative; by camera
     held_out: tuple[HeldOut, ...]
+    held: tuple[str, ...]  # stacks of unknowns that were not to be changed
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -415,6 +416,7 @@ def refine(
         moved=moved,
         lens_sigmas=lenses,
         held_out=_held_out(known, data, given_data, changed),
+        held=tuple(dict.fromkeys(s for s, _ in prior.at if s not in stacks)),
     )
 
 

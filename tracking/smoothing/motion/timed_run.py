@@ -216,7 +216,8 @@ class _TimedEstimator(_Estimator):
 
     def _interpolated(self, out: Interval) -> Interval:
         """The result of the last passes again, with the density for interpolation. The shocks stay those of `out`."""
-        self.interpolation_offset = self._interpolation(out).best_offset()
+        if not self.fresh:  # the first motion is that of the tracker's labels
+            self.interpolation_offset = self._interpolation(out).best_offset()
         for _ in range(LAST_PASSES if self.interpolation_offset else 0):
             before = self.ref
             new, moved = self._step(self._density(out, interpolating=True), False)
