@@ -389,7 +389,7 @@ def refine(
     known = Knowledge(difference(prior, values), covariance_root(prior.covariance))
     changed = np.concatenate([np.full(values[s].dof, s in stacks) for s, _ in prior.at])
     after = known.with_data(data, changed)
-    given_data = [t.reduced(stacks_of(rig)) for t in terms]
+    given_data = [] if for_labels else [t.reduced(stacks_of(rig)) for t in terms]
     S, _ = normal_equations(data)
     gain, vectors = np.linalg.eigh(known.root.T @ S @ known.root)
     directions = known.root @ vectors
@@ -415,7 +415,7 @@ def refine(
         p_change=known.excess(data)[0].p_value,
         moved=moved,
         lens_sigmas=lenses,
-        held_out=_held_out(known, data, given_data, changed),
+        held_out=() if for_labels else _held_out(known, data, given_data, changed),
         held=tuple(dict.fromkeys(s for s, _ in prior.at if s not in stacks)),
     )
 
