@@ -216,7 +216,7 @@ class _TimedEstimator(_Estimator):
 
     def _interpolated(self, out: Interval) -> Interval:
         """The result of the last passes again, with the density for interpolation. The shocks stay those of `out`."""
-        if not self.fresh:  # the first motion is that of the tracker's labels
+        if self.run.adapt_jerk and not self.fresh:  # the first motion is that of the tracker's labels
             self.interpolation_offset = self._interpolation(out).best_offset()
         for _ in range(LAST_PASSES if self.interpolation_offset else 0):
             before = self.ref
