@@ -300,6 +300,7 @@ class Refinement:
     moved: tuple[SuspectedFault, ...]  # parts that have changed by more than that
     lens_sigmas: Mapping[str, float]  # of focal lengths of which nothing is stated, relative; by camera
     held_out: tuple[HeldOut, ...]
+    held: tuple[str, ...]  # stacks of unknowns that were not to be changed
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -388,7 +389,7 @@ def refine(
     known = Knowledge(difference(prior, values), covariance_root(prior.covariance))
     changed = np.concatenate([np.full(values[s].dof, s in stacks) for s, _ in prior.at])
     after = known.with_data(data, changed)
-    given_data = [t.reduced(stacks_of(rig)) for t in terms]
+    given_data = [] if for_labels else [t.reduced(stacks_of(rig)) for t in terms]
     S, _ = normal_equations(data)
     gain, vectors = np.linalg.eigh(known.root.T @ S @ known.root)
     directions = known.root @ vectors
@@ -414,7 +415,8 @@ def refine(
         p_change=known.excess(data)[0].p_value,
         moved=moved,
         lens_sigmas=lenses,
-        held_out=_held_out(known, data, given_data, changed),
+        held_out=() if for_labels else _held_out(known, data, given_data, changed),
+        held=tuple(dict.fromkeys(s for s, _ in prior.at if s not in stacks)),
     )
 
 

@@ -143,7 +143,8 @@ def prior_of(rig: Rig, covariance: RigCovariance) -> tuple[Prior | None, dict[st
     values = stacks_of(rig)
     every = [(s, i) for s, stack in values.items() for i in range(len(stack))]
     place = {n: (a, k) for a in every for k, n in enumerate(names_at(rig, a))}
-    used: list[At] = list(dict.fromkeys(place[n][0] for n in covariance.names))
+    named = {place[n][0] for n in covariance.names}
+    used = [a for a in every if a in named]  # whatever the order of the names, as in every term
     if not used:
         return None, {}
     names, T = named_errors(rig, values, used)

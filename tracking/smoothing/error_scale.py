@@ -372,6 +372,7 @@ def variance_factors(
     cov = total[row] + calibration_cov
     free = 1 - 0.5 * np.einsum("knia,kab,knjb,knji->kn", J, P, J, np.linalg.inv(cov))  # share not taken by the pose
     usable = labelled & np.isfinite(uv).all(axis=-1) & (free > 0)
+    free = np.where(usable, free, 1.0)
     size2, own = 0.5 * np.trace(cov, axis1=2, axis2=3), 0.5 * np.trace(run.cov[row], axis1=2, axis2=3)
     residual = np.where(usable[..., None], run.uv[row] - uv, np.nan)
     part = np.minimum(place_px2[row], own)
@@ -386,7 +387,7 @@ def variance_factors(
     unknown = 0.5 * np.trace(calibration_cov, axis1=1, axis2=2) / size2
     square = 0.5 * np.sum(residual**2, axis=-1) / (size2 * free) + unknown / free
     step = 0.5 * np.sum(np.diff(residual, axis=0) ** 2, axis=-1) / (size2 * free)[1:]
-    weight = np.where(usable, free, 0.0)
+    weight = usable * free
     of_place = float(np.sum(weight * parts[..., 1:].sum(axis=-1))) / max(float(weight.sum()), 1e-9)
     every, independent = 2 * float(weight.sum()), 2 * float(np.sum(weight / np.where(usable, same, 1.0)))
     freedom = 1 / ((1 - of_place) ** 2 / max(every, 1e-9) + of_place**2 / max(independent, 1e-9))

@@ -24,6 +24,7 @@ from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, OFFSE
 from geometry.arrays import Array, finite
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
+from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import CLOCK, POSE, ROW_TIME, RigCovariance, split_name
 from lab.calibrate.camera.camera_page import LIMITS
 from lab.calibrate.refine.recordings import (
@@ -345,9 +346,22 @@ def _held_out_finding(r: Refinement) -> list[Finding]:
     words = f"held-out residuals {format_number(before)} sigmas with the given rig, {format_number(after)} refined"
     if p < P_HELD_OUT:
         return [finding("BP-F01", Level.FAIL, f"{words}; they contradict its covariance, p {format_p(p)}")]
-    if sum(h.log_density[1] - h.log_density[0] for h in held) <= 0 or after > before:
+    worse = sum(h.log_density[1] - h.log_density[0] for h in held) <= 0 or after > before
+    if others := _explained_by_others(r):
+        return [finding("BP-F05", Level.FAIL if worse else Level.WARN, f"{words}; {others}", variant="free")]
+    if worse:
         return [finding("BP-F02", Level.FAIL, words)]
     return [passed(f"{words}; they agree with its covariance, p {format_p(p)}")]
+
+
+def _explained_by_others(r: Refinement) -> str:
+    """How numbers that are held explain residuals that the changed ones leave; empty where they do not."""
+    every, dof = (sum(values) for values in zip(*((d.rest + float(d.y @ d.y), d.dof) for d in r.data), strict=True))
+    numbers = sum(r.values[stack].dof for stack, _ in r.at if stack in r.held)
+    if not numbers or sum(h.chi2[1] for h in r.held_out) - every < chi2_limit(P_HELD_OUT, numbers):
+        return ""
+    groups = [group for group, stacks in _STACKS_OF.items() if set(stacks) & set(r.held)]
+    return f"{format_number(float(np.sqrt(every / dof)))} if {', '.join(groups)} may change as well"
 
 
 def _used(result: RefinedRig) -> list[Finding]:

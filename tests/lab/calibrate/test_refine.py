@@ -402,6 +402,45 @@ def test_a_wrong_clock_is_corrected_to_its_sigma_and_the_first_camera_is_the_ref
     assert "cameras.right.time_offset_s" in (folder / "new" / "report.html").read_text()
 
 
+CAMERA_OFF = [0.004, -0.004, 0.003, 0.002, -0.002, 0.001]  # m, rad
+
+
+@pytest.fixture(scope="module")
+def moved_camera(tmp_path_factory) -> tuple[Path, Path]:
+    """A run of cameras with clocks of their own, and a rig.yaml of which camera right is off by about its sigmas."""
+    folder = tmp_path_factory.mktemp("moved-camera")
+    (run,) = recordings(folder, "clocks", count=1, frames=80)
+    rig = load_rig_file(run / "rig.yaml").rig
+    right = rig.cameras["right"]
+    off = replace(right, camera_from_world=right.camera_from_world.plus(np.array(CAMERA_OFF)))
+    save_rig(replace(rig, cameras={**rig.cameras, "right": off}), folder / "rig.yaml")
+    return run, folder / "rig.yaml"
+
+
+def test_the_order_in_which_sigmas_are_given_changes_nothing(moved_camera, tmp_path):
+    run, rig = moved_camera
+    sigmas = ["cameras.row_time_s=2e-6", "cameras.position_m=0.005", "cameras.rotation_deg=0.15"]
+    written = []
+    for number, order in enumerate((sigmas, sigmas[::-1])):
+        options = [word for sigma in order for word in ("--sigma", sigma)]
+        done = typed("refine", run, "--rig", rig, "--out", tmp_path / str(number), *options)
+        assert done.exit_code == 0, done.output
+        new = load_rig_file(tmp_path / str(number) / "rig.yaml")
+        covariance = joint_covariance(new.rig, new.covariances, "new")
+        written.append(dict(zip(covariance.names, np.diagonal(covariance.matrix) ** 0.5, strict=True)))
+    assert written[0] == pytest.approx(written[1], rel=1e-6)
+
+
+def test_what_is_held_is_named_where_it_explains_the_residuals_that_the_freed_numbers_leave(moved_camera, tmp_path):
+    """A camera is off and only row times may change: nobody should keep the given rig."""
+    run, rig = moved_camera
+    sigmas = ["cameras.row_time_s=2e-6", "cameras.position_m=0.005", "cameras.rotation_deg=0.15"]
+    options = [word for sigma in sigmas for word in ("--sigma", sigma)]
+    done = typed("refine", run, "--rig", rig, "--out", tmp_path / "new", *options, "--free", "shutter")
+    assert "if cameras may change as well" in done.output
+    assert "Leave out --free" in (tmp_path / "new" / "report.html").read_text()
+
+
 def test_a_run_with_the_refined_rig_has_its_clocks_and_states_their_sigmas(late, tmp_path):
     folder, run = late
     errors = {}

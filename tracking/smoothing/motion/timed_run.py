@@ -45,11 +45,11 @@ from tracking.smoothing.motion.turns import (
 )
 from tracking.smoothing.motion.whole_run import (
     CONVERGED_LOG_DENSITY,
-    CONVERGED_SIGMAS,
     GLOBAL_PASSES,
     NO_JUMPS_BEFORE,
     PARTIAL_WEIGHT,
     _Estimator,
+    at_rest,
 )
 
 FIRST_PASSES, LATER_PASSES = 14, 5  # with one strength of the jerk first, and after turns have changed
@@ -187,6 +187,7 @@ class _TimedEstimator(_Estimator):
         fastest = np.maximum(self.largest.max(axis=0), np.finfo(float).tiny)
         self.strongest = np.log(np.repeat(3 * fastest / frame_s**3, 3))
         super().__init__(instants.run, instants.assigned, known[1], used, core, motion)
+        self.per_frame = len(dt) / max(float(dt.sum()) / frame_s, 1.0)
         self._gaps_opened()
 
     def run_passes(self) -> SmoothedMotion:
@@ -210,8 +211,26 @@ class _TimedEstimator(_Estimator):
                 self.run, self.assigned, self.weight[self.core], at, info, np.exp(self.log_density)
             )
             self.turns = found
-        out = self._with_unresolved(out)
+        out = self._with_unresolved(self._interpolated(out))
         return replace(self._extrapolated(out), clocks=self.clocks, turns=tuple(self.turns))
+
+    def _interpolated(self, out: Interval) -> Interval:
+        """The result of the last passes again, with the density for interpolation. The shocks stay those of `out`."""
+        if self.run.adapt_jerk and not self.fresh:  # the first motion is that of the tracker's labels
+            self.interpolation_offset = self._interpolation(out).best_offset()
+        for _ in range(LAST_PASSES if self.interpolation_offset else 0):
+            before = self.ref
+            new, moved = self._step(self._density(out, interpolating=True), False)
+            if not (np.isfinite(new.x).all() and np.isfinite(new.pose_P).all()):
+                self.ref, self.interpolation_offset = before, 0.0
+                break
+            out = new._replace(shock=out.shock)
+            if at_rest(out, moved):
+                break
+        return out
+
+    def _edges(self) -> Bools:
+        return np.asarray(~self.measured | (self._jumps()[0].max(axis=1) > 0))
 
     def _with_other_clocks(self, turn: Turn) -> Turn:
         """A turn at the moments that it may have with other clocks: those found with the present ones confirm these."""
@@ -226,7 +245,8 @@ class _TimedEstimator(_Estimator):
         And with the differences to the motion by a jerk that turns in succession do not exclude, and to that by turns
         of their most likely lengths and by short ones that the spots do not exclude: a jerk rounds corners as well.
         """
-        hidden, search, turns = self._hidden(self._allowed_at_ends(), self.vague), self._search(), list(self.turns)
+        hidden, turns = self._hidden(self._allowed_at_ends(), self.vague), list(self.turns)
+        search = replace(self._search(), density=self._density(out, interpolating=True))
         short = [turn._replace(length_s=turn.likely_s) for turn in turns]
         short += self._possible(out.shock)
         short = [search.largest(turn, short) for turn in short]
@@ -288,10 +308,8 @@ class _TimedEstimator(_Estimator):
                 if number >= (NO_JUMPS_BEFORE if common > 0 else 1):
                     new = self._add_turns(np.where(jumping | self.continuous, 0.0, out.shock))
                     searching = new or not settled or number < common
-            else:
-                sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
-                if np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd):
-                    break
+            elif at_rest(out, moved):
+                break
         assert self.last is not None
         return self.last[0]
 

@@ -112,6 +112,7 @@ class _Estimator:
         self.fresh = motion.log_density is None
         self.log_density = self._first_density() if motion.log_density is None else motion.log_density[core].copy()
         self.interpolation_offset = motion.interpolation_offset
+        self.per_frame = 1.0  # instants at which the motion is estimated
         self.interior = np.ones(len(self.dt), dtype=bool)  # (T,) frames that all passes so far found to be interior
 
     def run_passes(self) -> SmoothedMotion:
@@ -128,8 +129,7 @@ class _Estimator:
                     raise FloatingPointError("the smoothing pass has no finite first step")
                 break
             out = result
-            sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
-            converged = bool(np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd))
+            converged = at_rest(out, moved)
             new = np.zeros_like(self.jumped)
             if self.jumps and (adapting or not self.run.adapt_jerk) and number >= NO_JUMPS_BEFORE:
                 new = new_jumps(out.shock, self.jumped)
@@ -190,11 +190,16 @@ class _Estimator:
         """(T,): frames farther than twice the smoother's memory from any gap, jump or end."""
         info, _ = self._information(self.ref)
         share = np.einsum("kij,kji->k", out.pose_P, info.information)[self.measured]
-        usual = float(np.median(share)) / 6 if len(share) else 1.0
-        memory = int(np.clip(np.ceil(2 / max(usual, 1e-3)), 3, 200))
-        edge: Bools = np.concatenate([[True], ~self.measured | self.jumped, [True]])
+        shown = share[share > 0]  # instants of frames with no spots of their own have none
+        usual = float(np.median(shown)) * len(shown) / (6 * len(share)) if len(shown) else 1.0
+        memory = int(np.clip(np.ceil(2 / max(usual, 1e-3 / self.per_frame)), 3, 200 * self.per_frame))
+        edge: Bools = np.concatenate([[True], self._edges(), [True]])
         near: Bools = largest_near(edge, memory)[1:-1]
         return ~near
+
+    def _edges(self) -> Bools:
+        """(T,): frames of gaps and velocity jumps."""
+        return ~self.measured | self.jumped
 
     def log_evidence(self) -> float:
         """Log-likelihood of the spots, nats up to a constant, with the motion integrated out.
@@ -318,6 +323,12 @@ class _Estimator:
         return SmoothedMotion(
             ref, log_density, self.interpolation_offset, jumped, pose_P, motion_P, known, self.weight,
         )  # fmt: skip
+
+
+def at_rest(out: Interval, moved: Array) -> bool:
+    """Whether a pass has moved no frame, by (T, 18), by more than a share of its sigma."""
+    sd = np.sqrt(np.maximum(np.diagonal(out.pose_P, axis1=1, axis2=2), 1e-30))
+    return bool(np.all(np.abs(moved[:, :6]) < CONVERGED_SIGMAS * sd))
 
 
 def _damped(info: RunInformation, damping: float) -> RunInformation:
