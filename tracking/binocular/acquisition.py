@@ -250,8 +250,9 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
         ]
         found += [fit for fit in fits if fit is not None]
         found = distinct(found)
-        if found and (found[0].index >= 0).sum() >= _ENOUGH * expected:
-            break
+        enough = found and (found[0].index >= 0).sum() >= _ENOUGH * expected
+        if enough and explains_a_picture(found[0], model, images):
+            break  # four markers may lie as four others of the target do: then all triples are tried
     # The best of many hypotheses explains more by chance than a single one.
     return [replace(f, evidence=f.evidence - np.log(max(tried, 1))) for f in found]
 
