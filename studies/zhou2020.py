@@ -9,21 +9,29 @@ import numpy as np
 from geometry import rotations
 from geometry.arrays import Array
 from geometry.pose import Pose
+from geometry.pose_solver.gauss_newton import PoseFit
 from geometry.rotations import ypr_from_matrix
 from lab.report.plot import svg
 from lab.targets.stereo.simulated_recording import drogue_markers, occluded, render, scene, simulated_pair, true_pixels
 from studies.comparison import Comparison, ComparisonRow, Figure
 from studies.learned_detector.samples import draw_sample
-from tracking.binocular.acquisition import first_fit
+from tracking.binocular.acquisition import mirrored
 from tracking.binocular.joint_fit import (
     MarkerObservations,
     bound,
+    fit_pose,
     linear_points,
     pose_of_points,
     triangulate,
     undistorted_pixels,
 )
-from tracking.binocular.marker_model import SegmentationParameters, StereoPair, project, project_markers
+from tracking.binocular.marker_model import (
+    MarkerModel,
+    SegmentationParameters,
+    StereoPair,
+    project,
+    project_markers,
+)
 from tracking.binocular.segmentation import ColourRange, marker_candidates, prepared
 from tracking.learned_detector.detector import find_drogues
 
@@ -76,8 +84,7 @@ def distance_errors(
         uv = project_markers(true, model, pose)[0] + rng.normal(0, noise_px, (2, len(model), 2))
         flat = np.stack([undistorted_pixels(c, u[:1]) for c, u in zip(pair.cameras, uv, strict=True)])
         points = triangulate(pair, uv, cov)
-        fit = first_fit(pair, model, MarkerObservations(uv, cov))
-        assert fit is not None
+        fit = least_misfit(pair, model, MarkerObservations(uv, cov), pose)
         found = (linear_points(pair, flat)[0], points.points[0], fit.world_from_body.apply(model.positions[0]))
         far = float(np.linalg.norm(marker))
         errors.append([float(np.linalg.norm(x)) - far for x in found])
@@ -88,6 +95,12 @@ def distance_errors(
         every = by_pose @ bound(true, model, pose, cov, seen) @ by_pose
         bounds.append([float(np.sqrt(sight @ single @ sight)), float(np.sqrt(every))])
     return DistanceErrors(distance_m, np.array(errors), np.array(bounds))
+
+
+def least_misfit(pair: StereoPair, model: MarkerModel, observed: MarkerObservations, true: Pose) -> PoseFit:
+    """The joint fit of labelled markers: the better one of the two attitudes that a flat target far away has."""
+    fits = [fit_pose(pair, model, observed, start) for start in (true, mirrored(pair, model, true))]
+    return min((fit for fit in fits if fit is not None), key=lambda fit: fit.chi2)
 
 
 def random_pose(distance_m: float, rng: np.random.Generator) -> Pose:
@@ -122,8 +135,7 @@ def pose_errors(trials: int, noise_px: float, rng: np.random.Generator) -> PoseE
         uv = project_markers(pair, model, pose)[0] + rng.normal(0, noise_px, (2, len(model), 2))
         flat = np.stack([undistorted_pixels(c, u) for c, u in zip(pair.cameras, uv, strict=True)])
         horn = pose_of_points(model.positions, linear_points(pair, flat))
-        fit = first_fit(pair, model, MarkerObservations(uv, cov))
-        assert fit is not None
+        fit = least_misfit(pair, model, MarkerObservations(uv, cov), pose)
         delta = pose.minus(fit.world_from_body)
         sigmas = np.sqrt(np.diagonal(bound(pair, model, pose, cov, seen)))
         rows.append((pose.minus(horn), delta, sigmas, float(delta @ np.linalg.solve(fit.covariance, delta))))

@@ -37,6 +37,7 @@ RANK_TOLERANCE = 1e-7
 # it, the sigmas of the pixels change by up to some per cent.
 NEAR_M, NEAR_RAD = 0.05, np.deg2rad(1.0)
 _MOST_ITERATIONS = 25
+_LEAST_GAINED = 0.25  # of the predicted gain, below which the damping rises: Marquardt's rule
 
 
 class PoseModel(Protocol):
@@ -189,15 +190,18 @@ def _fit(
         step, gain = _damped_step(H, g, damping)
         if not np.isfinite(gain):
             return None
+        raised = max(10 * damping, 1e-3)
         trial = Pose(*pose_plus(pose.rotation, pose.translation, step))
         trial_terms = _terms(model, rows, pixels, W, trial)
         if trial_terms is None or trial_terms[2] > cost * (1 + 1e-9) + 1e-12:
-            damping = max(10 * damping, 1e-3)
+            damping = raised
             if damping > 1e8:
                 break
             continue
+        # Where residuals bend the cost, whole steps go to and fro across the minimum and gain less than predicted.
+        poor = cost - trial_terms[2] < _LEAST_GAINED * gain
         pose, (H, g, cost, residuals, projected, J) = trial, trial_terms
-        damping = damping / 10 if damping > 1e-6 else 0.0
+        damping = raised if poor else damping / 10 if damping > 1e-6 else 0.0
         if gain < 1e-6:  # squared sigmas: the step was 1e-3 sigmas, and the remaining error is about its square
             break
     else:

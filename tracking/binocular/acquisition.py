@@ -15,8 +15,7 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import PoseFit
 from geometry.pose_solver.three_spots import poses_from_three_spots
 from geometry.rotations import angle
-from geometry.uncertainty.chi_square import chi2_tail
-from tracking.binocular.joint_fit import MarkerObservations, fit_pose, pose_of_points, triangulate, undistorted_pixels
+from tracking.binocular.joint_fit import MarkerObservations, fit_pose, triangulate, undistorted_pixels
 from tracking.binocular.marker_model import MarkerImages, MarkerModel, MatchParameters, StereoPair, project_markers
 
 # Which candidate in each picture is which marker, for a pose that is roughly known; the fit and its evidence.
@@ -250,8 +249,9 @@ def acquire(pair: StereoPair, model: MarkerModel, images: Images, p: MatchParame
         ]
         found += [fit for fit in fits if fit is not None]
         found = distinct(found)
-        if found and (found[0].index >= 0).sum() >= _ENOUGH * expected:
-            break
+        enough = found and (found[0].index >= 0).sum() >= _ENOUGH * expected
+        if enough and explains_a_picture(found[0], model, images):
+            break  # four markers may lie as four others of the target do: then all triples are tried
     # The best of many hypotheses explains more by chance than a single one.
     return [replace(f, evidence=f.evidence - np.log(max(tried, 1))) for f in found]
 
@@ -289,8 +289,7 @@ def mirrored(pair: StereoPair, model: MarkerModel, pose: Pose) -> Pose:
     Seen from far away, a flat target has two attitudes with almost equal images. Source: ours; Schweighofer & Pinz
     (2006), "Robust pose estimation from a planar target", IEEE Trans. PAMI 28, describe the ambiguity.
     """
-    centred = model.positions - model.positions.mean(axis=0)
-    normal = pose.rotation @ np.linalg.svd(centred)[2][-1]
+    normal = pose.rotation @ model.normal
     eye = np.mean([c.camera_from_world.inverse().translation for c in pair.cameras], axis=0)
     middle = pose.apply(model.positions.mean(axis=0))
     sight = (middle - eye) / np.linalg.norm(middle - eye)
@@ -407,62 +406,3 @@ def _coarse(pair: StereoPair, model: MarkerModel, flat: Sequence[Array], images:
                 nearest[:, own] = np.nan_to_num((du * du + dv * dv).min(axis=2), nan=np.inf)
         score += np.maximum(0.0, 1 - nearest / gate2).sum(axis=1)
     return score
-
-
-# The pose of labelled markers without a start: Horn's pose of the triangulated points, then the joint fit.
-#
-# Far away the triangulated points give a poor attitude, and a flat target has two. The fit starts from Horn's pose and
-# from poses of three markers each (P3P), each also with the normal reflected, and keeps the least misfit. Source: ours.
-
-_STARTS = 3  # poses of three markers that are tried
-_TRIPLES = 4  # sets of three markers, of each camera, of which poses are computed
-_PLAUSIBLE_P, _CLEAR_CHI2 = 1e-3, 25.0  # misfit of a right pose, and how much larger that of a wrong one is
-
-
-def first_fit(pair: StereoPair, model: MarkerModel, observed: MarkerObservations) -> PoseFit | None:
-    """The pose with the least misfit; None where no start leads to one."""
-    both = np.flatnonzero(observed.seen.all(axis=0))
-    found: list[PoseFit] = []
-    if len(both) >= 3:
-        points = triangulate(pair, observed.uv_px[:, both], observed.cov_px2[:, both])
-        if np.isfinite(points.points).all():
-            found = _fits(pair, model, observed, pose_of_points(model.positions[both], points.points))
-    if not _clear(found):
-        for start in _three_marker_poses(pair, model, observed):
-            found += _fits(pair, model, observed, start)
-    return min(found, key=lambda fit: fit.chi2, default=None)
-
-
-def _fits(pair: StereoPair, model: MarkerModel, observed: MarkerObservations, start: Pose) -> list[PoseFit]:
-    """The fits from a pose and from the one with the normal reflected."""
-    fits = (fit_pose(pair, model, observed, pose) for pose in (start, mirrored(pair, model, start)))
-    return [fit for fit in fits if fit is not None and fit.observable]
-
-
-def _clear(found: list[PoseFit]) -> bool:
-    """Whether the best of two fits is plausible and the other one is another pose, much worse."""
-    if len(found) < 2:
-        return False
-    best, other = sorted(found, key=lambda fit: fit.chi2)
-    same = same_pose(best.world_from_body, other.world_from_body)
-    plausible = best.dof > 0 and chi2_tail(best.chi2, best.dof) > _PLAUSIBLE_P
-    return plausible and not same and other.chi2 - best.chi2 > _CLEAR_CHI2
-
-
-def _three_marker_poses(pair: StereoPair, model: MarkerModel, observed: MarkerObservations) -> list[Pose]:
-    """Poses of triples that one camera sees, those with the smallest residuals of all markers."""
-    poses: list[Pose] = []
-    for c, camera in enumerate(pair.cameras):
-        triples = [t for t in marker_triples(model) if observed.seen[c, list(t)].all()][:_TRIPLES]
-        for triple in triples:
-            eye, rays = camera.rays(observed.uv_px[c, list(triple)])
-            if not np.isfinite(rays).all():
-                continue
-            solved = poses_from_three_spots(np.broadcast_to(eye, (3, 3)), rays, model.positions[list(triple)])
-            good = np.isfinite(solved.translation).all(axis=-1)
-            poses += [solved[int(i)].inverse() for i in np.flatnonzero(good)]
-    if not poses:
-        return []
-    apart = np.nan_to_num(project_markers(pair, model, Pose.stack(poses))[0] - observed.uv_px, nan=0.0)
-    order = np.argsort((apart**2).sum(axis=(1, 2, 3)))
-    return [poses[int(i)] for i in order[:_STARTS]]

@@ -101,11 +101,12 @@ class MarkerModel:
     colour: Ints  # (K,) index of the colour range
     radius_m: Array  # (K,), nan where it is not known
     sigma_m: float = 0.0  # of each coordinate of `positions`: how well the markers are surveyed
+    normal: Array = field(init=False, repr=False)  # (3,) of the plane that fits best
     facing: Array = field(init=False, repr=False)  # (K, 3), m: normals of discs, as long as their radii; 0: not known
 
     def __post_init__(self) -> None:
-        normal = np.linalg.svd(self.positions - self.positions.mean(axis=0))[2][-1]
-        object.__setattr__(self, "facing", np.nan_to_num(self.radius_m)[:, None] * normal)
+        object.__setattr__(self, "normal", np.linalg.svd(self.positions - self.positions.mean(axis=0))[2][-1])
+        object.__setattr__(self, "facing", np.nan_to_num(self.radius_m)[:, None] * self.normal)
 
     def __len__(self) -> int:
         return len(self.names)

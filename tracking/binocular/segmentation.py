@@ -22,8 +22,11 @@ from geometry.arrays import Array, Bools
 from tracking.binocular.marker_model import MarkerImages, SegmentationParameters
 
 Bytes = NDArray[np.uint8]
+Planes = tuple[Bytes, Bytes, Bytes]  # (h, w) each of hue, saturation and value
 _MARGIN_PX = 3  # around a region: partly covered pixels, with defocus up to a sigma of 1.5 px
 _RING_PX = 4  # around that: background
+_MARGIN = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1))
+_NEIGHBOURS = np.ones((3, 3), np.uint8)
 _FEWEST_RING = 12  # pixels of background for its colour and its covariance
 _FEWEST_INNER = 9  # pixels inside a marker for the variance of its shading
 _LEAST_VARIANCE_DN2 = 1.0  # of a pixel of the background: rounding and a little noise
@@ -49,16 +52,20 @@ class ColourRange:
             if not 0 <= low < high <= 1:
                 raise ValueError(f"{name}: expected two rising numbers from 0 to 1, got {[low, high]}")
 
-    def mask(self, hsv: Bytes) -> Bytes:
-        """255 where a picture (h, w, 3) in OpenCV's HSV (hue 0 to 179) has the colour, else 0."""
+    def mask(self, hsv: Planes) -> Bytes:
+        """255 where a picture, (h, w) each of OpenCV's hue (0 to 179), saturation and value, has the colour, else 0."""
         low, high = (self.hue_deg[0] / 2, self.hue_deg[1] / 2)
-        parts = [(low, high)] if low <= high else [(low, 180.0), (0.0, high)]
-        s, v = (np.array(r) * 255 for r in (self.saturation, self.value))
-        out = np.zeros(hsv.shape[:2], np.uint8)
-        for first, last in parts:
-            bottom, top = np.floor([first, s[0], v[0]]), np.ceil([last, s[1], v[1]])
-            out |= cv2.inRange(hsv, bottom, top).astype(np.uint8)
+        out = _within(hsv[0], low, 180.0 if low > high else high)
+        if low > high:
+            out |= _within(hsv[0], 0.0, high)
+        for plane, (first, last) in zip(hsv[1:], (self.saturation, self.value), strict=True):
+            out &= _within(plane, 255 * first, 255 * last)
         return out
+
+
+def _within(plane: Bytes, low: float, high: float) -> Bytes:
+    """255 where a plane (h, w) is within two limits, rounded outwards, else 0."""
+    return np.asarray(cv2.inRange(plane, int(np.floor(low)), int(np.ceil(high))), dtype=np.uint8)
 
 
 def brightened(picture: Bytes, gamma: float) -> Bytes:
@@ -73,25 +80,25 @@ def is_grey(picture: Bytes) -> bool:
     return cv2.norm(blue, green, cv2.NORM_INF) == 0 and cv2.norm(green, red, cv2.NORM_INF) == 0
 
 
-def in_hsv(picture: Bytes) -> Bytes:
-    """A picture (h, w, 3), BGR, in OpenCV's HSV (hue 0 to 179)."""
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV), dtype=np.uint8)
+def in_hsv(picture: Bytes) -> Planes:
+    """Hue (0 to 179), saturation and value, (h, w) each, of a picture (h, w, 3), BGR."""
+    hue, saturation, value = (np.asarray(p, np.uint8) for p in cv2.split(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)))
+    return hue, saturation, value
 
 
-def specified(hsv: Bytes, reference: Bytes) -> Bytes:
-    """A picture (h, w, 3), HSV, whose value channel gets the histogram of the reference's, HSV.
+def specified(hsv: Planes, reference: Planes) -> Planes:
+    """A picture in HSV whose value channel gets the histogram of the reference's.
 
     The printed method does not name the channel. With the value alone, hue and saturation stay, on which the
     segmentation rests.
     """
-    own, wanted = (np.cumsum(cv2.calcHist([p], [2], None, [256], [0, 256])) for p in (hsv, reference))
+    own, wanted = (np.cumsum(cv2.calcHist([p[2]], [0], None, [256], [0, 256])) for p in (hsv, reference))
     levels = np.searchsorted(wanted / wanted[-1], own / own[-1] - 1e-12)
-    same = np.arange(256)
-    table = np.stack([same, same, np.minimum(levels, 255)], axis=-1).astype(np.uint8)
-    return np.asarray(cv2.LUT(hsv, table[None]), dtype=np.uint8)
+    value = cv2.LUT(hsv[2], np.minimum(levels, 255).astype(np.uint8))
+    return hsv[0], hsv[1], np.asarray(value, dtype=np.uint8)
 
 
-def prepared(left: Bytes | None, right: Bytes | None, p: SegmentationParameters) -> tuple[Bytes | None, Bytes | None]:
+def prepared(left: Bytes | None, right: Bytes | None, p: SegmentationParameters) -> tuple[Planes | None, Planes | None]:
     """Both pictures as the segmentation sees them, HSV: the left one brightened, the right one with its histogram."""
     bright = None if left is None else in_hsv(brightened(left, p.gamma))
     if right is None:
@@ -101,7 +108,7 @@ def prepared(left: Bytes | None, right: Bytes | None, p: SegmentationParameters)
     return bright, specified(in_hsv(right), bright)
 
 
-def colour_mask(hsv: Bytes, colour: ColourRange, p: SegmentationParameters) -> Bytes:
+def colour_mask(hsv: Planes, colour: ColourRange, p: SegmentationParameters) -> Bytes:
     """The cleaned mask (h, w) of a colour in a prepared picture, 0 or 255."""
     mask = colour.mask(hsv)
     if p.median_px > 1:
@@ -114,7 +121,7 @@ def colour_mask(hsv: Bytes, colour: ColourRange, p: SegmentationParameters) -> B
 
 
 def marker_candidates(
-    picture: Bytes, as_seen: Bytes, colours: Sequence[ColourRange], p: SegmentationParameters
+    picture: Bytes, as_seen: Planes, colours: Sequence[ColourRange], p: SegmentationParameters
 ) -> MarkerImages:
     """The regions of the colours in a picture (h, w, 3), BGR, with centroids, covariances and areas.
 
@@ -166,64 +173,55 @@ def _measured(
     measured = None
     if p.centroid == "coverage":
         others = (anywhere[box] > 0) & ~own
-        near = _dilated(own, _MARGIN_PX)
-        ring = ~near & ~_dilated(others, _MARGIN_PX)
+        near = cv2.dilate(filled, _MARGIN) > 0
+        ring = ~near & (cv2.dilate(others.astype(np.uint8), _MARGIN) == 0)
         if ring.sum() >= _FEWEST_RING and not (near & others).any():
-            measured = _coverage_centroid(picture[box].astype(float), own, near, ring)
+            measured = _coverage_centroid(picture[box].astype(float), filled, near, ring)
             if measured is None:
                 return None
-    uv, cov, size = _contour_centroid(own) if measured is None else measured
+    uv, cov, size = _contour_centroid(own, len(outline)) if measured is None else measured
     return uv + np.array([left, top]), cov + p.sigma_floor_px**2 * np.eye(2), size
 
 
-def _contour_centroid(own: Bools) -> tuple[Array, Array, float]:
-    """Centroid (2,), covariance (2, 2) and area of a region by its outer contour: the paper's.
+def _contour_centroid(own: Bools, edge_px: int) -> tuple[Array, Array, float]:
+    """Centroid (2,), covariance (2, 2) and area of a region within its outer contour of edge_px pixels: the paper's.
 
     An edge is known to a whole pixel, uniformly: its n pixels shift the centroid by 0.29 px over the root of n.
     """
-    contours, _ = cv2.findContours(own.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    contour = max(contours, key=len)
-    filled = np.zeros(own.shape, np.uint8)
-    cv2.drawContours(filled, [contour], -1, 1, cv2.FILLED)
-    v, u = np.nonzero(filled)
-    sigma = _CONTOUR_SIGMA * np.sqrt(2.0 / max(len(contour), 1))
+    v, u = np.nonzero(own)
+    sigma = _CONTOUR_SIGMA * np.sqrt(2.0 / edge_px)
     return np.array([u.mean(), v.mean()]), sigma**2 * np.eye(2), float(len(u))
 
 
-def _coverage_centroid(patch: Array, own: Bools, near: Bools, ring: Bools) -> tuple[Array, Array, float] | None:
+def _coverage_centroid(patch: Array, own: Bytes, near: Bools, ring: Bools) -> tuple[Array, Array, float] | None:
     """Centroid (2,), covariance (2, 2) and area, px^2, of a region by the share of its colour in each pixel.
 
-    patch (h, w, 3): DN. The share is the linear discriminant (Fisher 1936) between the core of the region and a ring of
-    background around it: it ignores those changes of colour that occur in the background itself, such as the edge of
-    the target against the sky. near: the region with its partly covered pixels. None where the region does not differ
-    from its background by more than noise. Source: ours.
+    patch (h, w, 3): DN; own: 1 in the region. The share is the linear discriminant (Fisher 1936) between the core of
+    the region and a ring of background around it: it ignores those changes of colour that occur in the background
+    itself, such as the edge of the target against the sky. near: the region with its partly covered pixels. None where
+    the region does not differ from its background by more than noise. Source: ours.
     """
-    core = cv2.erode(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    core = own if not core.any() else core
-    background = patch[ring].mean(axis=0)
-    apart = patch[core].mean(axis=0) - background
-    spread = np.cov(patch[ring].T) + _LEAST_VARIANCE_DN2 * np.eye(3)
+    core = cv2.erode(own, _NEIGHBOURS) > 0
+    outside = patch[ring]
+    background = outside.mean(axis=0)
+    apart = patch[core if core.any() else own > 0].mean(axis=0) - background
+    around = outside - background
+    spread = around.T @ around / (len(around) - 1) + _LEAST_VARIANCE_DN2 * np.eye(3)
     direction: Array = np.linalg.solve(spread, apart).astype(float)
     contrast = float(direction @ apart)
     if contrast < _LEAST_CONTRAST2:
         return None
-    share: Array = (patch - background) @ direction / contrast
-    weight = float(share[near].sum())
+    share: Array = (patch - background) @ (direction / contrast)
+    at = np.argwhere(near)[:, ::-1]
+    own_share = share[near]
+    weight = float(own_share.sum())
     if weight < 1.0:
         return None
-    v, u = np.mgrid[: own.shape[0], : own.shape[1]]
-    at = np.stack([u[near], v[near]], axis=1)
-    centre = share[near] @ at / weight
+    centre = own_share @ at / weight
     arm = at - centre
     # Shading inside the marker is no noise of the sensor: its variance counts where it is larger than the ring's.
-    inner = cv2.erode(own.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # without partly covered pixels
+    inner = cv2.erode(own, _NEIGHBOURS, iterations=2) > 0  # without partly covered pixels
     shading = float(share[inner].var()) if inner.sum() >= _FEWEST_INNER else 0.0
     variance = max(float(share[ring].var()), shading, 1e-8)
     cov = variance * (arm.T @ arm) / weight**2
     return centre, cov, weight
-
-
-def _dilated(mask: Bools, pixels: int) -> Bools:
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
-    out: Bools = cv2.dilate(mask.astype(np.uint8), kernel) > 0
-    return out

@@ -128,7 +128,9 @@ def find_drogues(
     weights = weights or WEIGHTS
     rows, levels = first_candidates(picture, smallest_px, largest_px, weights)
     found = np.array([_seen_again(row, levels, weights) for row in rows]).reshape(-1, 4)
-    found = _distinct(_without_parts(found[found[:, 0] >= min(min_confidence, WHOLE_CONFIDENCE)]))
+    # A look that gives another size than the candidate's shows something else, mostly smaller than the network can see.
+    same = np.abs(np.log(found[:, 3] / rows[:, 3])) < np.log(ALIKE_RATIO)
+    found = _distinct(_without_parts(found[same & (found[:, 0] >= min(min_confidence, WHOLE_CONFIDENCE))]))
     return [DrogueCandidate(u, v, diameter, c) for c, u, v, diameter in found.tolist() if c >= min_confidence]
 
 

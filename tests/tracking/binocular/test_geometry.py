@@ -11,7 +11,6 @@ from geometry.rotations import ypr_from_matrix
 from geometry.uncertainty.rig_uncertainty import RigCovariance
 from studies.zhou2020 import PRINTED_ROTATION, pose_errors
 from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, pose_at
-from tracking.binocular.acquisition import first_fit
 from tracking.binocular.joint_fit import (
     MarkerObservations,
     fit_pose,
@@ -142,16 +141,6 @@ def test_a_calibration_error_within_its_covariance_is_within_the_covariance_of_t
         nees.append(delta @ np.linalg.solve(fit.covariance, delta))
         assert np.linalg.eigvalsh(fit.covariance - fit.systematic)[0] > 0
     assert 0.65 < np.mean(nees) / 6 < 1.4  # sigma of the mean: 0.12; without the calibration's part: 16
-
-
-def test_the_first_fit_finds_the_pose_of_a_far_target_from_labels_alone():
-    rng = np.random.default_rng(10)
-    for i in range(4):
-        pose = pose_at(25, i)
-        uv = project_markers(PAIR, MODEL, pose)[0] + rng.normal(0, 0.05, (2, len(MODEL), 2))
-        fit = first_fit(PAIR, MODEL, MarkerObservations(uv, COV))
-        delta = pose.minus(fit.world_from_body)
-        assert delta @ np.linalg.solve(fit.covariance, delta) < 30
 
 
 def test_the_printed_rotation_is_a_rotation_with_the_corrected_entry():

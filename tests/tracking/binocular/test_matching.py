@@ -5,6 +5,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from geometry import rotations
+from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_camera
 from studies.zhou2020 import random_pose
@@ -83,6 +85,45 @@ def test_any_four_of_seven_markers_are_enough_at_the_start(distance):
         assert consistent(pose, frame)
         found += frame.status is PoseStatus.MEASURED
     assert found >= 5
+
+
+# Two recordings of four of seven discs (f 1000 px, baseline 1 m): sigma and images, px, quaternion and place, m. Of
+# the first, four other discs explain all images (chi-square 40 of 10). Of the second, the right pose lies beside its
+# mirrored one, where whole Gauss-Newton steps go to and fro.
+TURNS = np.deg2rad([4, 58, 99, 161, 214, 259, 322])
+RIM = np.column_stack([0.34 * np.cos(TURNS), 0.34 * np.sin(TURNS), [0, 0.1, 0.03, 0.09, 0, 0.07, 0.12]])
+FOUR = [
+    (
+        0.062,
+        [[597.649, 448.212], [627.244, 433.115], [614.093, 454.377], [619.498, 423.139]],
+        [[562.966, 419.166], [570.543, 429.309], [557.383, 450.458], [540.952, 444.331]],
+        ([0.980929, 0.077348, -0.035697, -0.174706], [-0.570289, -0.830277, 20.0]),
+    ),
+    (
+        0.045,
+        [[657.507, 420.244], [635.568, 410.663], [649.611, 452.803], [633.208, 455.17]],
+        [[560.057, 451.303], [562.606, 406.666], [584.41, 416.518], [576.376, 449.06]],
+        ([0.993241, 0.052207, 0.097512, 0.035202], [-0.027399, -0.692839, 15.0]),
+    ),
+]
+
+
+@pytest.mark.parametrize(("sigma", "left", "right", "true"), FOUR)
+def test_four_markers_that_lie_almost_as_four_others_do_are_not_taken_for_these(sigma, left, right, true):
+    matrix = np.array([[1000, 0, 639.5], [0, 1000, 479.5], [0, 0, 1]])
+    R = rotations.exp(np.deg2rad([0.2, -0.4, 0.3]))
+    pair = StereoPair(
+        (
+            Camera("left", "", (1280, 960), matrix, (), Pose.identity()),
+            Camera("right", "", (1280, 960), matrix, (), Pose(R, -R @ [1.0, 0.0, 0.0])),
+        )
+    )
+    model = MarkerModel(tuple("1234567"), RIM, np.zeros(7, int), np.full(7, np.nan))
+    cov = np.broadcast_to(sigma**2 * np.eye(2), (4, 2, 2))
+    seen = tuple(MarkerImages(np.array(uv), cov, np.full(4, np.nan), np.zeros(4, int)) for uv in (left, right))
+    frame = BinocularTracker(pair, model, P).step(0.0, seen)
+    assert frame.status is PoseStatus.MEASURED
+    assert consistent(Pose.from_quaternion(np.array(true[0]), np.array(true[1])), frame)
 
 
 def test_three_markers_are_enough_for_a_target_that_is_followed():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.related_measurements.learned_detector import (
+    drawn,
     fitted,
     is_right,
     logistic,
@@ -13,6 +14,7 @@ from bench.related_measurements.learned_detector import (
     recall_at,
     reliability,
 )
+from bench.related_measurements.renderers import second_renderer
 from studies.learned_detector.samples import draw_sample
 from tracking.drogue_circle.detectors import Window
 from tracking.learned_detector import detector
@@ -34,6 +36,13 @@ def test_pictures_without_a_drogue_have_no_confident_candidate():
     rng = np.random.default_rng(32)
     empty = [draw_sample(rng, (320, 240), (12.0, 120.0), empty=True).image for _ in range(12)]
     assert np.mean([any(c.confidence > 0.7 for c in find_drogues(e, 10.0)) for e in empty]) <= 0.1
+
+
+@pytest.mark.parametrize("number", [21, 41])
+def test_a_candidate_that_is_another_thing_when_enlarged_is_none(number):
+    """Ground without a drogue: candidates of 25 and 29 px, in whose place the looks show something of 10 and 9 px."""
+    picture = drawn(second_renderer, "ground", 4221, number).image
+    assert not find_drogues(picture, 9.0, 200.0, 0.5)
 
 
 def test_a_window_gives_the_drogue_at_its_place_and_nothing_outside_its_gate(samples):

@@ -224,6 +224,20 @@ def test_a_target_whose_area_changes_as_it_starts_to_move_is_followed(fastest):
     assert set(statuses[60:]) == {PoseStatus.MEASURED}
 
 
+def test_of_a_target_that_is_whole_one_area_in_twenty_is_unusual_and_the_others_have_the_sigmas_of_their_noise():
+    rng, in_part, widths = np.random.default_rng(4), [], []
+    for _ in range(15):
+        tracker, path = PointTracker(FIXED), motion(rng, 150)
+        for k, found in enumerate(seen(rng, path)):
+            area = 200.0 * np.exp(0.02 * rng.standard_normal())
+            estimate = tracker.step(1.0, replace(found, flux=np.array([100.0 * area]), peak=np.array([100.0])))
+            if k >= 50:
+                in_part.append(tracker.in_part)
+                widths.append(np.sqrt(estimate.P[0, 0]))
+    assert 0.03 < np.mean(in_part) < 0.065  # more than two sigmas of a normal distribution: .046
+    assert np.mean(np.array(widths) > 1.1 * np.median(widths)) < 0.15
+
+
 def test_a_target_that_came_nearer_while_it_was_hidden_is_soon_as_certain_as_before():
     tracker, sigmas = PointTracker(FIXED), []
     for k in range(120):
