@@ -9,7 +9,7 @@ that of a registration of pictures (Lucas & Kanade 1981), with the rotation of a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
@@ -51,6 +51,7 @@ _MIDDLE_VARIANCE = 1.2  # variance of the mean of the middle half of normal devi
 _MOSTLY, _STILL_SHARE = 0.85, 0.5  # of the pictures, in which a landmark stands still; least share of those that do
 _LEAST_PX = 0.01  # movements with a smaller root mean square are none: few spots are better than that
 _CLEAR = 0.75  # times its error, which is 3.5 times that of landmarks with noise of their own: a movement is corrected
+_ONE = 0.5  # of the farthest movement: a larger one between two pictures is that of a camera that is moved once
 _PARTS, _STEP = 10, 9.0  # of a recording; square of their mean movement over its variance, above which that is a step
 _SLOW_SHARE = 0.3  # variance of the mean of the movements over theirs, above which they are slow
 _BEFORE = 3  # pixels before a place in the filter of 8 pixels that moves a picture
@@ -91,6 +92,7 @@ class CameraMotion:
     farthest_px: float = 0.0  # between two pictures
     mean_variance_px2: float = 0.0  # of their mean, along each axis: the same in all pictures
     pictures: int = 1  # from which the mean is known
+    moved_between: tuple[int, int] | None = None  # numbers of pictures; None: not at once
 
     @staticmethod
     def of(
@@ -134,13 +136,17 @@ class CameraMotion:
         about = None if turned is None else motion._about_mean([turn for _, turn in turned])
         return None if turned is None or about is None else (about, turned)
 
-    def with_mean_of(self, pictures: Sequence[Picture], clips: float) -> CameraMotion:
-        """With the mean attitude of more pictures of the recording for that to which spots are corrected."""
-        motions = np.array([turn.motion for _, turn in self._turns_in(pictures, clips) or ()])
-        if len(motions) <= self.pictures:
+    def with_mean_of(self, pictures: Mapping[int, Picture], clips: float) -> CameraMotion:
+        """With the mean attitude of more pictures of the recording, by number, as that to which spots are corrected."""
+        turns = {number: found[1].motion for number, p in pictures.items() if (found := self._turned(p, clips))}
+        if len(turns) <= max(self.pictures, len(pictures) // 2):
             return self
+        numbers, motions = list(turns), np.array(list(turns.values()))
         moved = (motions - motions.mean(axis=0)) @ self._middle.T
-        return replace(self, offset=motions.mean(axis=0), pictures=len(motions))._with_spread(moved)
+        out = replace(self, offset=motions.mean(axis=0), pictures=len(motions))._with_spread(moved)
+        steps = np.linalg.norm(np.diff(moved, axis=0), axis=1)
+        at = int(np.argmax(steps))
+        return replace(out, moved_between=(numbers[at], numbers[at + 1])) if steps[at] > _ONE * out.farthest_px else out
 
     def stilled(self, picture: Picture, clips: float) -> tuple[Picture | None, Turn | None]:
         """A picture (h, w) moved to where the camera does not turn, and its turn, which `corrected` needs.

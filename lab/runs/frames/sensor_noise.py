@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -140,10 +140,11 @@ class CameraNoise:
             background = call(static_background, pictures, self.model, shift, without_wide(usual), others_move)
             self.motion, self.wide, self.background = motion, wide, background
 
-    def follow_motion(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
-        """Find the mean attitude of a camera that moves in these pictures, and note that it does."""
+    def follow_motion(self, pictures: Mapping[int, Picture], parameters: DetectParameters) -> None:
+        """Find the mean attitude of a camera that moves in these pictures, by number, and note that it does."""
         if self.motion is not None and pictures:
-            self.motion = self.motion.with_mean_of(pictures, self.saturation_dn(pictures[0], parameters))
+            clips = self.saturation_dn(next(iter(pictures.values())), parameters)
+            self.motion = self.motion.with_mean_of(pictures, clips)
             if self.motion.is_slow:
                 if self.motion.mean_variance_px2 > _SMALL_PX**2:
                     self.moved_px = self.motion.farthest_px
@@ -306,8 +307,9 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
         noise.make_background([p for p in spread if isinstance(p, np.ndarray)], run.tracker.detect)
         if noise.motion is not None:
             numbers = source.numbers if isinstance(source, PictureFiles) else np.arange(VIDEO_FRAMES)
-            every = pictures_of_frames(source, evenly_spread(numbers, MOTION_PICTURES).tolist(), size_px).values()
-            noise.follow_motion([p for p in every if isinstance(p, np.ndarray)], run.tracker.detect)
+            every = pictures_of_frames(source, evenly_spread(numbers, MOTION_PICTURES).tolist(), size_px)
+            usable = {k: p for k, p in every.items() if isinstance(p, np.ndarray)}
+            noise.follow_motion(usable, run.tracker.detect)
     else:
         noise.look_for_wide(pictures[::2], run.tracker.detect)
     rows = RowCounts()

@@ -72,7 +72,7 @@ def judge(
     found = [f for f in given if f.code == _SET_UP]
     found += _mosaics({name: own.mosaic for name, own in noise.items() if own.mosaic}, verdict(given))
     found += _too_wide({name: own.too_wide_px for name, own in noise.items() if own.too_wide_px}, statistics)
-    found += _moved({name: own.moved_px for name, own in noise.items() if own.moved_px})
+    found += _moved(noise)
     found += _averaging({name: own.kept for name, own in noise.items()}, stretch)
     for name in (name for name, own in noise.items() if own.interlaced):
         what = f"even and odd rows of the pictures of camera {name} show the moving spots at two places: interlaced"
@@ -124,12 +124,16 @@ def _mosaics(mosaics: Mapping[str, float], fit: Level) -> list[Finding]:
     return [finding("BP-V18", max(Level.WARN, fit), what, numbers=mosaics)]
 
 
-def _moved(moved_px: Mapping[str, float]) -> list[Finding]:
+def _moved(noise: Mapping[str, CameraNoise]) -> list[Finding]:
     """Cameras that were moved, as what stands still in their pictures shows."""
     out = []
-    for name, px in moved_px.items():
-        what = f"what stands still in the pictures of camera {name} has moved by {px:.2g} px during the recording"
-        numbers = {"camera": name, "moved_px": px}
+    for name, own in noise.items():
+        if not own.moved_px:
+            continue
+        between = None if own.motion is None else own.motion.moved_between
+        when = "during the recording" if between is None else f"between frames {between[0]} and {between[1]}"
+        what = f"what stands still in the pictures of camera {name} has moved by {own.moved_px:.2g} px {when}"
+        numbers = {"camera": name, "moved_px": own.moved_px, "moved_between": between}
         out.append(finding("BP-V19", Level.WARN, what, variant="pictures", numbers=numbers))
     return out
 

@@ -176,6 +176,7 @@ def test_cameras_that_are_moved_during_a_recording_are_named_and_the_sigmas_cont
     assert {name: n["moved_px"] for name, n in named.items()} == pytest.approx(
         dict.fromkeys(("left", "right"), 2.1), rel=0.15
     )
+    assert [n["moved_between"] for n in named.values()] == [[step_at - 1, step_at]] * 2
 
 
 def test_cameras_that_are_moved_by_many_pixels_are_named(tmp_path):
