@@ -228,7 +228,9 @@ class _Light:
         """
         values, variance, uv = self.seen.around(self.there, self.box, more, step)
         without = self.seen.around(self.empty, self.box, more, step)[0]
-        near = np.linalg.norm(self.others[:, None, :2] - uv, axis=-1) < self.others[:, None, 2]
+        reach = self.box[2] + more + 1 + self.others[:, 2]
+        others = self.others[np.abs(self.others[:, :2] - self.box[:2]).max(axis=1) < reach]
+        near = np.linalg.norm(others[:, None, :2] - uv, axis=-1) < others[:, None, 2]
         clear = ~near.any(axis=0)
         variance = variance[:, clear]
         return uv[clear], values[:, clear], variance, mean_of(without[:, clear], variance)

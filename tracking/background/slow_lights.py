@@ -26,6 +26,7 @@ _MODULATED = 0.3  # share of the fitted light of a spot by which the true one ma
 _MOVED = 1.7  # ratio of the places of moving lights in all pictures to those in one
 _WELL = 1.5  # chi-square per degree of freedom of a fit to the picture, up to which the spot stands on even ground
 _UNEXPLAINED = 5.0  # sigmas of light that is in no fitted spot: such a pixel of a picture does not count
+_DARK = 16.0  # widths from a light, beyond which it is 0 in single precision
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +110,17 @@ class SlowLights:
 
 
 def light_at(spots: Detections, u: Ints, v: Ints) -> NDArray[np.float32]:
-    """The light of Gaussian spots at pixels (m,), DN."""
+    """The light of Gaussian spots at pixels (m,), DN; v rises."""
     out = np.zeros(len(u), np.float32)
     for i in range(len(spots)):
-        du, dv = u - spots.uv_px[i, 0], v - spots.uv_px[i, 1]
+        reach = _DARK * (float(spots.major_px[i]) + 1.0)
+        near = slice(*np.searchsorted(v, spots.uv_px[i, 1] + [-reach, reach]))
+        du, dv = u[near] - spots.uv_px[i, 0], v[near] - spots.uv_px[i, 1]
         turn = np.radians(spots.angle_deg[i])
         major, minor = (np.hypot(x, np.sqrt(1 / 12)) for x in (spots.major_px[i], spots.minor_px[i]))
         along, across = du * np.cos(turn) + dv * np.sin(turn), dv * np.cos(turn) - du * np.sin(turn)
         height = spots.flux[i] / (2 * np.pi * major * minor)
-        out += (height * np.exp(-0.5 * ((along / major) ** 2 + (across / minor) ** 2))).astype(np.float32)
+        out[near] += (height * np.exp(-0.5 * ((along / major) ** 2 + (across / minor) ** 2))).astype(np.float32)
     return out
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geometry.arrays import Array, Ints
+from geometry.arrays import Array, Bools, Ints
 from geometry.camera import SensorNoise
 from tracking.detection.block_search import TEXTURE, Blocks, bin_pixels, find_highest_between, runs_of
 from tracking.detection.candidates import PeakSearch, block_workspace
@@ -214,10 +214,9 @@ class SpotFinder:
         if count > len(self._separate):  # bright objects have many peaks, which must not displace spots in even places
             first = np.argsort(_insignificance(peaks[order], task.model), kind="stable")[: len(self._separate)]
             order = order[np.sort(first)]
-        places = np.stack([peaks["u"], peaks["v"]], axis=-1)
-        away = np.abs(places[:, None] - regions[:, :2]).max(axis=2)
+        away = np.maximum(*(np.abs(peaks[x][:, None] - regions[:, i]) for i, x in enumerate("uv")))
         # Around them, peaks of their spots are measured, and of others beside those.
-        wanted = (away <= regions[:, 2] + np.maximum(regions[:, 2], MARGIN)).any(axis=1)
+        wanted: Bools = np.any(away <= regions[:, 2] + np.maximum(regions[:, 2], MARGIN), axis=1)
         near, threshold = (self._near, self._gaps), task.limits.threshold_sigma
         n = find_separate_peaks(task.pixels, peaks, order, wanted, task.noise, threshold, self._separate, *near)
         chosen = self._separate[: min(n, self.most)].copy()
