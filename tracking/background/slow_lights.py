@@ -26,7 +26,7 @@ _MODULATED = 0.3  # share of the fitted light of a spot by which the true one ma
 _MOVED = 1.7  # ratio of the places of moving lights in all pictures to those in one
 _WELL = 1.5  # chi-square per degree of freedom of a fit to the picture, up to which the spot stands on even ground
 _UNEXPLAINED = 5.0  # sigmas of light that is in no fitted spot: such a pixel of a picture does not count
-_DARK = 16.0  # widths from a light, beyond which it is 0 in single precision
+_UNLIT = 16.0  # widths from a light, beyond which it is 0 in single precision
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ def light_at(spots: Detections, u: Ints, v: Ints) -> NDArray[np.float32]:
     """The light of Gaussian spots at pixels (m,), DN; v rises."""
     out = np.zeros(len(u), np.float32)
     for i in range(len(spots)):
-        reach = _DARK * (float(spots.major_px[i]) + 1.0)
+        reach = _UNLIT * (float(spots.major_px[i]) + 1.0)
         near = slice(*np.searchsorted(v, spots.uv_px[i, 1] + [-reach, reach]))
         du, dv = u[near] - spots.uv_px[i, 0], v[near] - spots.uv_px[i, 1]
         turn = np.radians(spots.angle_deg[i])
