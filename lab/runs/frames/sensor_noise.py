@@ -114,7 +114,7 @@ class CameraNoise:
         """Whether pictures spread over the recording show that the camera moves."""
         if not pictures or self.optics is None or self.model is None:
             return False
-        clips = saturation_of(self._with_saturation(parameters, pictures[0]), pictures[0])
+        clips = self.saturation_dn(pictures[0], parameters)
         return CameraMotion.at_first(pictures, self.optics, self.model, clips) is not None
 
     def make_background(
