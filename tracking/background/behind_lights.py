@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
-from tracking.background.joint_fit import UNLIKE, JointFit, Modulation, fitted, mean_of
+from tracking.background.joint_fit import MODULATED, UNLIKE, JointFit, Modulation, fitted, mean_of, share_at
 from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, inside, near_each, nearest
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
@@ -23,7 +23,8 @@ _AROUND = 1.5  # widths beyond the box that are fitted
 _LEAST_CLEAR = 0.5  # share of these pixels that other lights do not reach
 _SAMPLES, _MOST_SAMPLES = 3.0, 2500  # pixels that are fitted: per width of the light, and in all
 _USUAL_FITS = 2.0  # as many fits as the usual scatter counts
-_LARGEST_SIGMA = 0.1  # of the modulated share: of a light that passes, and of a camera
+_LARGEST_SIGMA = 0.1  # of the modulated share
+_SHARES = np.linspace(0.0, 1.0, 101)  # modulated ones that are compared
 _LACKS = 0.5  # of the height, by which a picture without the light is darker
 _MOST_PASSING = 10  # lights on uneven ground that are fitted: those that show the modulation best
 _ALSO_BRIGHT, _SELDOM = 0.3, 0.2  # of the brightest's flux: a second light in the box; share of the pictures with it
@@ -132,7 +133,7 @@ def passing_lights(
         empty = ground[row, column].astype(float), count[row, column] / variance[0]
         height, strength = float(light.peak[0]), seen.strength_at([k], light.uv_px)
         fit = fitted(uv, values, variance, light.uv_px, width, height, empty, strength=strength)
-        if fit is not None and fit.modulated_share(seen.usual_dn)[1] < _LARGEST_SIGMA**2:
+        if fit is not None:
             fits.append(fit)
     return fits
 
@@ -143,7 +144,7 @@ def _step(width_px: float) -> int:
 
 
 def _shown_by(background: NDArray[np.float32], count: Ints, light: Detections, seen: Exposures) -> float:
-    """How precisely a light on ground (h, w), DN above black, shows the share that this modulates: about 1 / sigma."""
+    """1 / sigma of the share that usual ground modulates, as a light on ground (h, w), DN above black, shows it."""
     reach = max(float(light.major_px[0]), 1.0)
     (left, top), (right, low) = (light.uv_px[0] + more for more in (-reach, reach))
     box = np.s_[max(int(top), 0) : max(int(low) + 2, 0), max(int(left), 0) : max(int(right) + 2, 0)]
@@ -154,27 +155,33 @@ def _shown_by(background: NDArray[np.float32], count: Ints, light: Detections, s
     unlit, lit = seen.noise.variance(level + seen.black_dn + np.array([0.0, light.peak[0]]))
     own = float(unlit) / float(np.mean(count[box]))
     clear = float(light.peak[0]) * np.sqrt(part.size / float(lit))
-    return float(np.sqrt(max(float(np.var(part)) - 2 * own, 0.0))) / level * clear
+    slope = float(share_at(np.array(MODULATED[0]), np.array(level / seen.usual_dn))[1])
+    return float(np.sqrt(max(float(np.var(part)) - 2 * own, 0.0))) / level * clear * slope
 
 
 def _modulation(fits: Sequence[JointFit], seen: Exposures) -> Modulation | None:
-    """The modulation of all lights of a camera: the weighted median, and the scatter, known beforehand to be usual.
+    """The modulation of all lights of a camera: the most likely one, by errors with outliers, and the scatter.
 
-    Lights on even ground do not show it.
+    That is known beforehand to be usual. Lights on even ground do not show the modulation, those on dark ground hardly.
     """
-    share, variance = np.array([fit.modulated_share(seen.usual_dn) for fit in fits]).reshape(-1, 2).T
+    share, variance = np.array([fit.shown for fit in fits]).reshape(-1, 2, 1).transpose(1, 0, 2)
+    ratio = np.array([fit.level_dn / seen.usual_dn for fit in fits]).reshape(-1, 1)
+    expected, slope = share_at(_SHARES, ratio)
+    spread2 = variance + (UNLIKE * slope) ** 2
+    cost = np.sum(0.5 * np.log(spread2) + 2 * np.log1p((share - expected) ** 2 / spread2 / 3), axis=0)  # Student's, 3
+    middle = float(_SHARES[np.argmin(cost)])
+    likely = np.exp(np.min(cost) - cost)
+    expected, slope = share_at(np.array(middle), ratio)
+    off, variance = ((share - expected) / slope)[:, 0], (variance / slope**2)[:, 0]  # of shares on usual ground
     weight = 1 / (variance + UNLIKE**2)
     if float(np.sum(weight)) < 1 / (UNLIKE**2 + _LARGEST_SIGMA**2):
         return None
-    order = np.argsort(share)
-    upto = np.cumsum(weight[order]) / np.sum(weight)
-    middle = float(np.interp(0.5, upto - 0.5 * weight[order] / np.sum(weight), share[order]))
-    middle = float(np.clip(middle, 0.0, 1.0))
     # Each fit counts by how precisely it shows the scatter.
     clear = (UNLIKE**2 * weight) ** 2
-    scatter = _USUAL_FITS * UNLIKE**2 + float(np.sum(clear * np.maximum((share - middle) ** 2 - variance, 0.0)))
-    unlike = float(np.sqrt(scatter / (_USUAL_FITS + max(float(np.sum(clear)) - 1, 0.0))))
-    return Modulation(middle, seen.usual_dn, unlike, seen.black_dn)
+    scatter = _USUAL_FITS * UNLIKE**2 + float(np.sum(clear * np.maximum(off**2 - variance, 0.0)))
+    unlike2 = scatter / (_USUAL_FITS + max(float(np.sum(clear)) - 1, 0.0))
+    own = float(likely @ (_SHARES - middle) ** 2 / np.sum(likely))
+    return Modulation(middle, seen.usual_dn, float(np.sqrt(unlike2 + own)), seen.black_dn)
 
 
 class _Part(NamedTuple):

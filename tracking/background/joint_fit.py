@@ -41,8 +41,15 @@ _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
 # Widths: error of the places that the model leaves. With it the products of the errors in successive pictures agree
 # with the stated shared variance (63 lights in front of photographs).
+_LEAST_SHOWN = 1e-3  # share of the information on the modulation
 _LEAST_SIGMA = 0.002
 _LARGEST_CHANGE = 3.0  # of the width, as a factor, from the start
+
+
+def share_at(share: Array, ratio: Array) -> tuple[Array, Array]:
+    """Of a modulated share on usual ground: that on ground of another brightness, over the usual; its derivative."""
+    more = share * ratio
+    return more / (1 - share + more), ratio / (1 - share + more) ** 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +63,8 @@ class Modulation:
 
     def at(self, level_dn: float) -> tuple[float, float]:
         """The share where the surface has this light, DN above black, and the sigma by which places differ."""
-        more = self.share * level_dn / self.level_dn
-        return more / (1 - self.share + more), self.unlike
+        share, slope = share_at(np.array(self.share), np.array(level_dn / self.level_dn))
+        return float(share), float(slope) * self.unlike
 
     def response(self, surface: Array | NDArray[np.float32]) -> Array:
         """The light where the surface has these grey values, DN, over that where it is B0."""
@@ -218,6 +225,15 @@ class JointFit:
     light: JointLight
     share: float  # variance of the errors that its places share, over that of one of them by the noise of its picture
     strength_cov: Array  # (2, 2): of p and q
+    level_dn: float  # DN above black, of the ground
+    expected: tuple[float, float]  # share of the light that this modulates, before the fit, and its sigma
+
+    @property
+    def shown(self) -> tuple[float, float]:
+        """The share of the light that the ground modulates, and its variance, by the pictures alone."""
+        (share, variance), (before, sigma) = self.modulated_share(self.level_dn), self.expected
+        left = max(1 - variance / sigma**2, _LEAST_SHOWN)  # of the information
+        return before + (share - before) / left, variance / left
 
     def modulated_share(self, level_dn: float) -> tuple[float, float]:
         """The share of the light that the surface's brightness modulates, where that is `level_dn`; its variance."""
@@ -324,4 +340,5 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
         return None
     # The noise of the background, 1 / n, is in its information as well.
     shared = max(every - (1 + 1 / n) * own, 0.0) * max(chi2, 1.0) + (_LEAST_SIGMA * float(widths.max())) ** 2
-    return JointFit(light, float(shared / max(own, 1e-9)), covariance[:2, :2] * max(chi2, 1.0))
+    strength_cov = covariance[:2, :2] * max(chi2, 1.0)
+    return JointFit(light, float(shared / max(own, 1e-9)), strength_cov, pixels.usual, pixels.modulated)

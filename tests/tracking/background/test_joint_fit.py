@@ -176,6 +176,28 @@ def test_lights_that_pass_over_edges_show_the_modulation_and_how_unlike_their_pl
     assert not passing_lights(pictures, found, even, count)
 
 
+@pytest.mark.parametrize("modulated", [0.0, 0.3])
+def test_lights_on_dark_ground_hardly_show_what_usual_ground_modulates(modulated):
+    """A tenth as bright as usual: what is expected before any light is seen must not count as seen."""
+    side, usual_dn = 160, 25.0
+    y, x = np.mgrid[:side, :side].astype(float)
+    ground = gaussian_filter(1.5 + 2.0 * (np.sin(x / 4 + y / 9) > 0), 0.5).astype(np.float32)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        found, seen = [], []
+        for k in range(12):
+            u, v = np.array([25.0 + 10 * k, 30.0 + 20 * (k % 5)]) + rng.uniform(-1, 1, 2)
+            light = 26.0 * (1 - modulated + modulated * ground / usual_dn)
+            light *= np.exp(-0.5 * ((x - u) ** 2 + (y - v) ** 2) / 1.1**2)
+            seen.append(ground + light + 0.5 * rng.standard_normal(ground.shape))
+            spot = Detections.at(np.array([[u, v]]), np.eye(2)[None])
+            found.append(replace(spot, major_px=np.array([1.1]), minor_px=np.array([1.1]), peak=np.array([24.0])))
+        pictures = Exposures(seen, np.ones(np.shape(seen)[:2]), NoiseModel(0.25, 0.0, 0.0), usual_dn, 0.0)
+        fits = passing_lights(pictures, found, ground, np.full(ground.shape, 11))
+        shown = BehindLights.of(pictures, found, np.array([[3.0, 3.0, 2.0]]), fits).modulation
+        assert shown is None or abs(shown.share - modulated) < 2.5 * shown.unlike
+
+
 @pytest.mark.parametrize("length_px", [1.5, 3.0])
 def test_a_light_that_flickers_by_a_percent_is_measured_as_precisely_as_one_that_does_not(length_px):
     """On texture as fine as the light, which the surface modulates in full."""
