@@ -14,11 +14,11 @@ import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import cv2
 import numpy as np
 
+from bench.processes import results_of
 from bench.random_pictures.adapter import model_of_pictures
 from bench.random_pictures.judge import compared
 from bench.random_pictures.looks import FAMILIES
@@ -144,13 +144,12 @@ def main() -> None:
     names = [None] if a.family is None else list(FAMILIES) if a.family == "all" else [a.family]
     jobs = [Job(a.first + i, names[i % len(names)]) for i in range(a.scenes)]
     rows = []
-    with get_context("spawn").Pool(a.jobs) as pool:
-        for row in pool.imap(measured, jobs):
-            rows.append(row)
-            if a.verbose:
-                print(line(row), flush=True)
-            elif sys.stderr.isatty():
-                print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
+    for row in results_of(measured, jobs, a.jobs):
+        rows.append(row)
+        if a.verbose:
+            print(line(row), flush=True)
+        elif sys.stderr.isatty():
+            print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
     print(summary(rows))
 
 
