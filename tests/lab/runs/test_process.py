@@ -219,9 +219,7 @@ def test_the_summary_lists_inputs_parameters_and_versions(results, run_folder):
     assert {"python", "numpy", "beampose"} <= set(summary["versions"])
     assert summary["errors"] is not None  # there is truth
     assert summary["verdict"]["exit_status"] in (0, 4)
-    seconds = dict(summary["timings"])
-    assert min(seconds.values()) >= 0
-    assert sum(s for name, s in seconds.items() if name != "wall_s") <= seconds["wall_s"]
+    assert all(s >= 0 for s in summary["timings"].values())
 
 
 def test_the_summary_is_strict_json(results):
