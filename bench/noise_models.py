@@ -18,13 +18,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bench.processes import results_of
 from bench.random_pictures.adapter import model_of_pictures
 from bench.random_pictures.judge import compared
 from bench.random_pictures.looks import FAMILIES
 from bench.random_pictures.render import Renderer
 from bench.random_pictures.report import within
 from bench.random_pictures.scene import picture_scene
+from bench.random_scenes.processes import results_of
 
 AT_BACKGROUND, AT_HALF = 1.3, 2.0  # the goals: within these factors
 WORST = 15

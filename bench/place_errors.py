@@ -19,7 +19,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from bench.processes import results_of
+from bench.random_scenes.processes import results_of
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 
-from bench.processes import results_of
 from bench.random_pictures.judge import PictureJudgement, counted_pairs, judge
 from bench.random_pictures.looks import FAMILIES
 from bench.random_pictures.render import Renderer
@@ -19,6 +18,7 @@ from bench.random_pictures.report import crashed, details, summary, write_rows
 from bench.random_pictures.scene import picture_scene
 from bench.random_pictures.surroundings import photographs
 from bench.random_pictures.write_folder import write_pictures
+from bench.random_scenes.processes import results_of
 from lab.errors import BeamposeError
 from lab.runs.process import process_run
 

@@ -12,12 +12,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from bench.processes import results_of
 from bench.random_pictures.command import picture_jobs, run_pictures
 from bench.random_pictures.looks import FAMILIES as PICTURE_FAMILIES
 from bench.random_scenes.command import Job, judged
 from bench.random_scenes.families import FAMILIES
 from bench.random_scenes.judge import Judgement
+from bench.random_scenes.processes import results_of
 from bench.random_scenes.report import details, summary, write_rows
 from bench.random_scenes.variants import CHANGES
 
