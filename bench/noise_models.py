@@ -14,7 +14,6 @@ import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import cv2
 import numpy as np
@@ -25,6 +24,7 @@ from bench.random_pictures.looks import FAMILIES
 from bench.random_pictures.render import Renderer
 from bench.random_pictures.report import within
 from bench.random_pictures.scene import picture_scene
+from bench.random_scenes.processes import results_of
 
 AT_BACKGROUND, AT_HALF = 1.3, 2.0  # the goals: within these factors
 WORST = 15
@@ -144,13 +144,12 @@ def main() -> None:
     names = [None] if a.family is None else list(FAMILIES) if a.family == "all" else [a.family]
     jobs = [Job(a.first + i, names[i % len(names)]) for i in range(a.scenes)]
     rows = []
-    with get_context("spawn").Pool(a.jobs) as pool:
-        for row in pool.imap(measured, jobs):
-            rows.append(row)
-            if a.verbose:
-                print(line(row), flush=True)
-            elif sys.stderr.isatty():
-                print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
+    for row in results_of(measured, jobs, a.jobs):
+        rows.append(row)
+        if a.verbose:
+            print(line(row), flush=True)
+        elif sys.stderr.isatty():
+            print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
     print(summary(rows))
 
 

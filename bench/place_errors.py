@@ -14,12 +14,12 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
-from multiprocessing import get_context
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
+from bench.random_scenes.processes import results_of
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.rig import Beam, Rig, Screen, Spot
@@ -164,12 +164,7 @@ def main() -> None:
         )
     ]
     start = time.perf_counter()
-    if chosen.jobs == 1:
-        outcomes = [run_cell(cell) for cell in cells]
-    else:
-        with get_context("spawn").Pool(chosen.jobs) as pool:
-            outcomes = pool.map(run_cell, cells, chunksize=1)
-    print(table(outcomes))
+    print(table(list(results_of(run_cell, cells, chosen.jobs))))
     print(f"{len(cells)} recordings in {time.perf_counter() - start:.0f} s")
 
 

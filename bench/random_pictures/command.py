@@ -6,9 +6,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -20,6 +18,7 @@ from bench.random_pictures.report import crashed, details, summary, write_rows
 from bench.random_pictures.scene import picture_scene
 from bench.random_pictures.surroundings import photographs
 from bench.random_pictures.write_folder import write_pictures
+from bench.random_scenes.processes import results_of
 from lab.errors import BeamposeError
 from lab.runs.process import process_run
 
@@ -54,15 +53,6 @@ def judged(job: PictureJob) -> PictureJudgement:
         return judge(renderer, place / "out", outcome.exit_status, (rendered - start, ran - rendered))
 
 
-def run_all(jobs: list[PictureJob], workers: int) -> Iterator[PictureJudgement]:
-    """The results in the order of the jobs."""
-    if workers == 1:
-        yield from map(judged, jobs)
-        return
-    with get_context("spawn").Pool(workers) as pool:
-        yield from pool.imap(judged, jobs)
-
-
 def picture_jobs(
     seeds: range, family: str | None, frames: int | None, keep: Path | None, state_noise: bool
 ) -> list[PictureJob]:
@@ -76,7 +66,7 @@ def picture_jobs(
 def run_pictures(jobs: list[PictureJob], workers: int, out: Path | None, verbose: bool) -> None:
     """Run the scenes and print the summary; out: a CSV file with a row per scene."""
     rows: list[PictureJudgement] = []
-    for row in run_all(jobs, workers):
+    for row in results_of(judged, jobs, workers):
         rows.append(row)
         if verbose:
             print(details(row), flush=True)

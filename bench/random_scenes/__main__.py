@@ -10,69 +10,16 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
-import traceback
-from collections.abc import Iterator
-from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 from bench.random_pictures.command import picture_jobs, run_pictures
 from bench.random_pictures.looks import FAMILIES as PICTURE_FAMILIES
-from bench.random_scenes.answers import answers_in_memory, answers_through_files
-from bench.random_scenes.families import FAMILIES, family_scene
-from bench.random_scenes.judge import Judgement, judge
-from bench.random_scenes.oracle import ask_oracle
-from bench.random_scenes.report import crashed, details, summary, write_rows
-from bench.random_scenes.scene import Scene, random_scene
-from bench.random_scenes.variants import CHANGES, varied
-from bench.random_scenes.write_folder import write_run_folder
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """One scene to run."""
-
-    seed: int
-    frames: int | None
-    family: str | None
-    through_files: bool
-    keep: Path | None
-    variant: str | None = None
-
-
-def make_scene(job: Job) -> Scene:
-    """The scene of a job."""
-    if job.family is not None:
-        return family_scene(job.family, job.seed, job.frames)
-    scene = random_scene(job.seed) if job.frames is None else random_scene(job.seed, job.frames)
-    return scene if job.variant is None else varied(scene, job.variant)
-
-
-def judged(job: Job) -> Judgement:
-    """Draw, run and score one scene; an exception of the program counts as a class of failure."""
-    scene = make_scene(job)
-    if job.keep is not None:
-        write_run_folder(scene, job.keep / f"seed-{job.seed}")
-    oracle = ask_oracle(scene)
-    try:
-        if job.through_files:
-            with tempfile.TemporaryDirectory() as name:
-                answers = answers_through_files(scene, write_run_folder(scene, Path(name) / "run"))
-        else:
-            answers = answers_in_memory(scene)
-    except Exception:
-        return crashed(scene, oracle, traceback.format_exc())
-    return judge(scene, oracle, answers)
-
-
-def run_all(jobs: list[Job], workers: int) -> Iterator[Judgement]:
-    """The results in the order of the jobs."""
-    if workers == 1:
-        yield from map(judged, jobs)
-        return
-    with get_context("spawn").Pool(workers) as pool:
-        yield from pool.imap(judged, jobs)
+from bench.random_scenes.command import Job, judged
+from bench.random_scenes.families import FAMILIES
+from bench.random_scenes.judge import Judgement
+from bench.random_scenes.processes import results_of
+from bench.random_scenes.report import details, summary, write_rows
+from bench.random_scenes.variants import CHANGES
 
 
 def seed_range(text: str) -> range:
@@ -107,7 +54,7 @@ def main() -> None:
         return
     jobs = [Job(s, a.frames, a.family, a.through_files, a.keep, a.variant) for s in a.seeds]
     rows: list[Judgement] = []
-    for row in run_all(jobs, a.jobs):
+    for row in results_of(judged, jobs, a.jobs):
         rows.append(row)
         if a.verbose:
             print(details(row), flush=True)

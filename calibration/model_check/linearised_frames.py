@@ -263,9 +263,7 @@ def _worst_of_frame(lin: LinearisedFrames) -> Bools:
 
 MOSTLY_UNSEEN = 0.2  # a view measured in less than this share of the frames is reported
 FEWEST_FRAMES = 30  # in which it is expected: a shorter occlusion is no fault
-_INSIDE_PX = (
-    20.0  # distance from the picture's edge at which a whole spot is visible, even if its position is not exact
-)
+_INSIDE_PX = 20.0  # from the picture's edge, where a whole spot is visible even if its position is not exact
 
 
 @dataclass(frozen=True, slots=True)

@@ -475,7 +475,13 @@ def _describe_calibration(
     except CalibrationError as error:
         findings.unusable += str(error).splitlines()
     text = "the rig file does not state when it was calibrated"
+    today = datetime.date.today()
     if state is not None:
+        if state.date > today:
+            findings.remarks.append(
+                f"{path}: calibration.date: {state.date.isoformat()} is after {today.isoformat()} (today): correct it,"
+                " or the clock of this computer"
+            )
         until = "" if state.valid_until is None else f", {state.validity}"
         text = f"calibrated {state.date.isoformat()}: {state.verdict}{until}"
     known = "no covariance: sigmas will include the noise only"

@@ -6,12 +6,22 @@ import ast
 import re
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
+from calibration.lens.fit.lens_fit import CORNER_GATE
 from lab import errors
+from lab.calibrate.beams.beams_page import ARCSEC, BeamGoals
+from lab.calibrate.camera.pair import GOOD_RANGE_SHARE
+from lab.calibrate.rig.rig_page import RigLimits
+from lab.calibrate.screens.screen_page import ScreenLimits
 from lab.errors import InputError
 from lab.findings.finding import Finding, Level, entries, explain, finding, listed, sections
+from lab.runs.verdict import quality
+from lab.runs.verdict.score import KNOWN_TO
 from tests.paths import ROOT
+from tracking.background.camera_motion import FARTHEST_PX
+from tracking.light_tracker.frames import LightParameters
 
 CODE = re.compile(r"BP-[A-Z]\d\d")
 
@@ -132,3 +142,37 @@ def test_a_finding_has_the_texts_of_its_code_or_variant_unless_others_are_given(
 
 def test_a_finding_that_passes_keeps_its_code_and_drops_its_remedy():
     assert finding("BP-B01", Level.PASS, "a", remedy="c") == Finding(Level.PASS, "a", code="BP-B01")
+
+
+SCREEN, BEAM, RIG = ScreenLimits(), BeamGoals(), RigLimits()
+
+
+@pytest.mark.parametrize(
+    ("code", "words", "limits"),
+    [
+        ("BP-V03", "below {} %", [100 * quality.GOOD_MEASURED]),
+        ("BP-V07", "More than {} %", [100 * (1 - quality.GOOD_PICTURES)]),
+        ("BP-V19.pictures", "up to {} px", [FARTHEST_PX]),
+        ("BP-V20", "{} mm and {} mrad", [1e3 * KNOWN_TO, 1e3 * KNOWN_TO]),
+        ("BP-V20", "more than {} %", [100 * quality.MOST_WRONG]),
+        ("BP-S02", "above {} times, FAIL above {} times", [SCREEN.factor_warn, SCREEN.factor_fail]),
+        ("BP-S04", "More than {} %", [100 * SCREEN.outliers_fail]),
+        ("BP-S08", "above {} mm, FAIL above {} mm", [1e3 * SCREEN.scatter_warn_m, 1e3 * SCREEN.scatter_fail_m]),
+        ("BP-S09", "above {} mm, FAIL above {} mm", [1e3 * SCREEN.sigma_spot_warn_m, 1e3 * SCREEN.sigma_spot_fail_m]),
+        ("BP-B05", "More than {} %", [100 * BEAM.wrong_share]),
+        ("BP-B08", "above {} times", [BEAM.noise_scale]),
+        ("BP-B09", "above {} arcsec (RMS", [BEAM.direction / ARCSEC]),
+        ("BP-B09", "FAIL above {} arcsec", [BEAM.direction_unusable / ARCSEC]),
+        ("BP-R02", "above {} times, FAIL above {} times", [RIG.scale_warn, RIG.scale_fail]),
+        ("BP-R05", "above {} %, FAIL above {} %", [100 * RIG.wrong_warn, 100 * RIG.wrong_fail]),
+        ("BP-R07", "above {} times, FAIL above {} times", [RIG.hold_out_warn, RIG.hold_out_fail]),
+        ("BP-R09", "WARN above {} deg or {} mm", [np.rad2deg(RIG.attitude_warn), 1e3 * RIG.position_warn_m]),
+        ("BP-R09", "FAIL above {} deg or {} mm", [np.rad2deg(RIG.attitude_fail), 1e3 * RIG.position_fail_m]),
+        ("BP-L12", "more than {} sigmas", [CORNER_GATE]),
+        ("BP-Q03", "exceeds {} %", [100 * GOOD_RANGE_SHARE]),
+        ("BP-G01", "smaller than {} px", [LightParameters().smallest_px]),
+    ],
+)
+def test_a_limit_that_an_explanation_states_is_the_one_that_decides(code, words, limits):
+    code, _, variant = code.partition(".")
+    assert words.format(*(f"{limit:.4g}" for limit in limits)) in entries()[code].variant(variant).meaning

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from geometry.arrays import Array, Bools, Ints, robust_sigma
 from geometry.camera import Camera
 from geometry.compilation.jit import compiled_for_threads
-from tracking.background.mean_pictures import means_of
+from tracking.background.mean_pictures import MIDDLE_VARIANCE, means_of
 from tracking.background.places import AROUND_LIGHT, places_of
 from tracking.detection.detect import find_spots, saturation_of
 from tracking.detections import Detections
@@ -47,7 +47,6 @@ _NEAR_PX, _ON_PX = 0.03, 0.005  # a movement that is not undone but corrected; o
 _OUTLIER = 3.0  # sigmas: what a landmark leaves counts in full up to this, and not at all beyond twice of it
 _LARGEST_MISFIT = 1.6  # sigma of what the landmarks leave over their noise; above it something else has changed
 _UNDETERMINED = 1e12  # condition of the fit: of long focal lengths, where a rotation is nearly a shift, up to 1e9
-_MIDDLE_VARIANCE = 1.2  # variance of the mean of the middle half of normal deviates times their number
 _MOSTLY, _STILL_SHARE = 0.85, 0.5  # of the pictures, in which a landmark stands still; least share of those that do
 _LEAST_PX = 0.01  # movements with a smaller root mean square are none: few spots are better than that
 _CLEAR = 0.75  # times its error, which is 3.5 times that of landmarks with noise of their own: a movement is corrected
@@ -110,7 +109,7 @@ class CameraMotion:
         moved = [moved_by(p, about._movement(turn.motion - about.mean_motion), clips) for p, turn in at_first]
         mean = means_of(moved)[1]
         lit = places_of(find_spots(middle, parameters, noise), middle.shape, AROUND_LIGHT) | (mean >= clips)
-        motion = _landmarks(mean, len(moved) / _MIDDLE_VARIANCE, lit, camera, noise, _PER_TILE)
+        motion = _landmarks(mean, len(moved) / MIDDLE_VARIANCE, lit, camera, noise, _PER_TILE)
         turned = motion._turns_in(pictures, clips)
         if turned is None:
             return None

@@ -16,6 +16,7 @@ from tracking.noise import BLOCK, Picture
 MOST_BYTES = 150_000_000  # of these pictures
 STRIP = 4 * BLOCK  # rows that are computed at once: several arrays of them are in the processor's cache
 _CUT = 0.25  # share of the lowest and of the highest grey values of a pixel that is left out
+LOWER_VARIANCE, MIDDLE_VARIANCE = 1.4, 1.2  # of the means of `means_of`, times the pictures, over that of normal noise
 LEAST_CHANGE = 0.03  # the light has not changed by more than this share: the structure is not scaled
 LEAST_LIGHT, MOST_LIGHT = 0.2, 5.0  # changes of the light beyond which a picture is searched without subtraction
 GAIN_BITS = 8  # binary places of a factor on the difference

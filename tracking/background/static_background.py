@@ -21,6 +21,7 @@ from tracking.background.lights_on_edges import with_lights_on_edges
 from tracking.background.mean_pictures import (
     GAIN_BITS,
     LEAST_CHANGE,
+    LOWER_VARIANCE,
     highest_of_blocks,
     in_steps,
     raised_difference,
@@ -45,7 +46,6 @@ from tracking.noise_estimation.texture_shift import TextureShift
 from tracking.parameters import DetectParameters
 
 _HIGHEST = 30.0  # sigmas of noise and texture
-_MEAN_VARIANCE = 1.4  # variance of these means of normal deviates times their number: 1.4 lower half, 1.2 middle
 _LOW = 0.25  # quantile of the background whose noise the difference is taken to have; brighter places count as uneven
 _STEPS = 16  # grey values per DN: the differences are not rounded to whole DN
 _AS_WIDE = 0.7  # of a light at rest: what is in its middle and as wide is that light, brighter than in the mean
@@ -109,7 +109,7 @@ class StaticBackground:
     @property
     def _noise_share(self) -> float:
         """Variance of the background's own noise over that of a picture."""
-        return _MEAN_VARIANCE / self.pictures
+        return LOWER_VARIANCE / self.pictures
 
     def with_modulation(self, modulation: Modulation, at: tuple[Ints, Ints], response: Array) -> StaticBackground:
         """The background whose surface modulates the lights that fall on it; known responses (m,) at some pixels.
@@ -150,7 +150,7 @@ class StaticBackground:
     def of_mean(
         mean: NDArray[np.float32], pictures: Sequence[Picture], model: NoiseModel, parameters: DetectParameters
     ) -> StaticBackground:
-        share = _MEAN_VARIANCE / len(pictures)
+        share = LOWER_VARIANCE / len(pictures)
         smooth = smooth_part(mean)
         sigma = float(np.hypot(np.sqrt(model.floor_dn2), model.texture * model.black_dn))
         # In 16 bits there is no room for what is higher: a light, or a hot pixel.

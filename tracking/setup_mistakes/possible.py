@@ -141,7 +141,7 @@ SHOWN_BY = MappingProxyType(
 )
 
 
-FAR_M = 100.0  # a camera or screen farther from the others is not in a lab ...
+FAR_M = 100.0  # a camera or screen farther from the others, or a larger screen, is not in a lab ...
 FAR_ON_TARGET_M = 10.0  # ... and a point of a beam farther from the body's origin is not on a vehicle model
 SHORT_FOCAL = 1 / 12  # focal length over picture width of a perspective lens with a field of view of 161 deg
 PIXEL_MM = 0.005  # an assumed pixel, to try a focal length that is given in millimetres
@@ -262,8 +262,11 @@ def _units(rig: Rig) -> Iterator[Mistake]:
             break
     beams = [n for n, b in rig.beams.items() if np.linalg.norm(b.point) > FAR_ON_TARGET_M]
     in_metres = {n: replace(rig.beams[n], point=rig.beams[n].point / 1000) for n in beams}
-    groups = (("camera_from_world", cameras), ("world_from_screen", screens), ("point_m", beams))
-    words = [f"{field} of {_names(names)}" for field, names in groups if names]
+    sizes = {n: s.size_m for n, s in rig.screens.items() if s.size_m is not None and max(s.size_m) > FAR_M}
+    smaller = {n: replace(changed.screens[n], size_m=(w / 1000, h / 1000)) for n, (w, h) in sizes.items()}
+    changed = replace(changed, screens={**changed.screens, **smaller})
+    fields = ("camera_from_world", "world_from_screen", "size_m", "point_m")
+    words = [f"{f} of {_names(n)}" for f, n in zip(fields, (cameras, screens, list(sizes), beams), strict=True) if n]
     if words:
         yield Mistake(
             "unit",

@@ -420,9 +420,7 @@ def _points(cloud: Cloud) -> tuple[Array, list[str]]:
 # The pixels alone cannot detect a rotated or mirrored world frame; `calibrate screen` and `calibrate rig` start here.
 
 
-_SUSPICIOUS_MISFIT = (
-    4.0  # misfit (see calibration/screens/screens.py) above which swapped axes and wrong units are tested
-)
+_SUSPICIOUS_MISFIT = 4.0  # of calibration/screens/screens.py: above it, swapped axes and wrong units are tested
 _ACCEPTED_MISFIT = 2.0  # misfit below which a change to the survey is accepted as the explanation
 
 

@@ -24,9 +24,7 @@ from lab.files.text.atomic_write import atomic_write_text
 from lab.files.text.error_text import describe_value, is_formula, near_name, printable_line, suggest_name
 from lab.files.text.json_text import bytes_of_file
 
-MAX_COORDINATE_M = (
-    10_000.0  # m from the origin: coordinates of a national grid must be transformed to a local frame first
-)
+MAX_COORDINATE_M = 10_000.0  # from the origin: those of a national grid must be transformed to a local frame first
 MAX_SCAN_COORDINATE = 1e8  # units of a scanned cloud, which may be millimetres and in a national grid
 MARGIN_PICTURES = 1.0  # how far outside the picture, in picture widths, a pixel is accepted: predictions lie there
 MAX_TIME_S = 1e12  # s, thirty thousand years

@@ -145,15 +145,14 @@ class CameraNoise:
         if self.motion is not None and pictures:
             clips = self.saturation_dn(next(iter(pictures.values())), parameters)
             self.motion = self.motion.with_mean_of(pictures, clips)
+            how, remedy = "from picture to picture", ". Check its mount and the floor"
             if self.motion.is_slow:
-                if self.motion.mean_variance_px2 > _SMALL_PX**2:
-                    self.moved_px = self.motion.farthest_px
-                how, remedy = "once or slowly", "Find out when it was moved, and calibrate it again"
-            else:
-                how, remedy = "from picture to picture", "Check its mount and the floor"
+                how, remedy = "once or slowly", ". Find out when it was moved, and calibrate it again"
+                if self.motion.mean_variance_px2 > _SMALL_PX**2:  # a finding says when, and what to do
+                    self.moved_px, remedy = self.motion.farthest_px, ""
             self.notes.append(
                 f"{self.camera}: the camera moves by {self.motion.rms_px:.2g} px (rms) {how}; its spots are corrected"
-                f" by what stands still in its pictures. {remedy}"
+                f" by what stands still in its pictures{remedy}"
             )
 
     def look_for_wide(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:

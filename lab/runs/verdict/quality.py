@@ -37,9 +37,7 @@ LARGEST_NOISE_SCALE, GOOD_NOISE_SCALE = 5.0, 1.5
 GOOD_PICTURES = 0.95  # share of frames with a usable picture, per camera
 MOSTLY_EMPTY = 0.5  # share of a camera's pictures without any point of light, above which it is reported
 FEW_SHOWN = 0.1  # share of the frames with enough points, below which too few points are the reason, not the prior
-LONG_EMPTY = (
-    0.05  # duration, as a share of the run, of an empty end of a camera's recording, above which it is reported
-)
+LONG_EMPTY = 0.05  # share of the run of an empty end of a camera's recording, above which it is reported
 MOST_WRONG = 0.005  # share of the measured poses beyond 10 sigmas from the truth, up to which the run does not fail
 LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
 TOO_WIDE = "BP-V21"  # a light that max_sigma_px excludes, and a spot that is never found

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from calibration.boards.board_types import Chessboard, parse
-from calibration.boards.corner_refinement import _crossing, refined
+from calibration.boards.corner_refinement import _crossing, _weights_of_others, refined
 from calibration.boards.grid_shape import _ratio, local_shape
 from geometry import rotations
 from geometry.arrays import Array
@@ -87,10 +87,30 @@ def _mean_of_wave(x: Array) -> Array:
     return total
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("n", range(1, 12))
+def test_each_point_of_a_polynomial_is_given_by_the_others(n):
+    """Of a quadratic from four points on, of a cubic by the curves of third order from five on."""
+    x = np.arange(n) - 0.3 * n
+    weights = _weights_of_others(n)
+    if n < 4:
+        assert np.isnan(weights).all()
+        return
+    assert not np.diagonal(weights, axis1=1, axis2=2).any()
+    np.testing.assert_allclose(weights @ (0.7 + x - 0.2 * x**2), np.tile(0.7 + x - 0.2 * x**2, (2, 1)), atol=1e-9)
+    if n >= 5:
+        np.testing.assert_allclose(weights[1] @ x**3, x**3, atol=1e-9)
+
+
 @pytest.mark.parametrize(
-    ("turn", "seen_px"),
-    [((0.3, -0.4, 0.2), 300.0), ((0.5, 0.6, -0.4), 180.0), ((0.2, 0.5, 0.3), 330.0)],
+    ("lens", "turn", "seen_px"),
+    [
+        ("pinhole", (0.3, -0.4, 0.2), 300.0),
+        ("pinhole", (0.5, 0.6, -0.4), 180.0),
+        ("barrel", (0.2, 0.5, 0.3), 330.0),
+        ("pincushion", (0.3, -0.4, 0.2), 300.0),
+        ("fisheye", (0.5, 0.6, -0.4), 180.0),
+        ("fisheye", (0.2, 0.5, 0.3), 330.0),
+    ],
 )
 def test_corners_without_noise_are_where_the_board_is(lens, turn, seen_px):
     """Under any lens, with wide and narrow squares, whose edges cross aslant, and near a wide lens."""

@@ -100,6 +100,33 @@ def test_a_folder_may_have_a_dot_in_its_name(tmp_path):
     assert (tmp_path / "boards-v1.2" / "board.svg").is_file()
 
 
+@pytest.mark.parametrize(
+    ("out", "files"),
+    [
+        ("x.svg", ["x.svg", "x.yaml"]),
+        ("new/x.png", ["x.png", "x.yaml"]),
+        ("new", ["board.svg", "board.yaml"]),
+        ("there.svg", ["board.svg", "board.yaml"]),
+    ],
+)
+def test_the_files_that_the_line_names_are_written_and_no_others(tmp_path, out, files):
+    (tmp_path / "there.svg").mkdir()
+    for _ in range(2):  # the same board may be written again
+        done = write_board("chessboard:9x6:20mm", tmp_path / out, ["svg"])
+    found = [p for p in tmp_path.rglob("*") if p.is_file()]
+    assert sorted(p.name for p in found) == files
+    assert f": {', '.join(files)} in {found[0].parent}; " in done.line()
+    assert load_board(next(p for p in found if p.suffix == ".yaml")) == done.result
+    kind = found[0].read_bytes() if found[0].suffix != ".yaml" else found[1].read_bytes()
+    assert kind.startswith(b"\x89PNG") == files[0].endswith(".png")
+
+
+def test_a_description_of_another_board_is_not_replaced(tmp_path):
+    write_board("chessboard:9x6:20mm", tmp_path / "x.svg")
+    with pytest.raises(InputError, match="describes another board; choose another name"):
+        write_board("chessboard:9x6:21mm", tmp_path / "x.svg")
+
+
 def test_a_marker_too_large_for_its_square_is_not_printed_and_the_largest_size_is_reported(tmp_path):
     with pytest.raises(InputError, match=r"only 0\.01 marker modules .* make the markers 29\.1 mm or less"):
         write_board("charuco:5x7:36mm:35.9mm:DICT_4X4_50", tmp_path / "b")

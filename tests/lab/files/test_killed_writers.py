@@ -101,8 +101,10 @@ def kill_at_random(folder: Path, way: str, sent: signal.Signals, seed: int) -> N
     assert names(folder) == ["results"]
 
 
-@pytest.mark.parametrize("way", ["exchange", "two renames"])
-@pytest.mark.parametrize("sent", ["SIGKILL", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize(
+    ("sent", "way"),
+    [("SIGKILL", "exchange"), ("SIGKILL", "two renames"), ("SIGTERM", "exchange"), ("SIGHUP", "two renames")],
+)
 def test_a_process_killed_at_any_moment_leaves_complete_results(tmp_path, way, sent):
     for seed in range(3):
         kill_at_random(tmp_path / str(seed), way, signal.Signals[sent], seed)

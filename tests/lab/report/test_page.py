@@ -19,7 +19,7 @@ from lab.findings.finding import Finding, Level, counted
 from lab.report.calibration import calibration_drawings as draw
 from lab.report.calibration import calibration_scene as scene
 from lab.report.page import LARGEST_BYTES, Page, PageDrawing, PageTable, Section, cell, html_of, write_page
-from lab.report.plot.maps import contour_levels, contour_lines, heat_map, value_range
+from lab.report.plot.maps import _enlarged, contour_levels, contour_lines, heat_map, value_range
 from lab.report.plot.svg import image_area
 from tests.geometry.scenes import paper_rig
 
@@ -297,3 +297,17 @@ def test_the_cells_of_a_coverage_map_lie_where_their_corners_are():
     assert (y.min(), np.max(y + height)) == (pytest.approx(top, abs=0.2), pytest.approx(top + high, abs=0.2))
     assert np.sum(width * height) == pytest.approx(wide * high / 2, rel=0.02)
     assert text.count('stroke-opacity="0.8"/>') == len(x)
+
+
+def test_a_map_is_enlarged_between_its_values_and_has_no_value_where_none_is_near():
+    u, v = np.meshgrid(np.arange(7.0), np.arange(5.0))
+    values = 3 * u - 2 * v
+    large = _enlarged(values)
+    x = np.linspace(0, 6, large.shape[1]) * 3 - np.linspace(0, 4, large.shape[0])[:, None] * 2
+    np.testing.assert_allclose(large, x, atol=0.1)  # cv2.remap has steps of 1/32 of a cell
+    values[2, 3] = np.nan
+    holed = _enlarged(values)
+    hole = np.isnan(holed)
+    assert 0.3 / 24 < hole.mean() < 1.0 / 24  # half a cell to each side, of 4 x 6
+    np.testing.assert_allclose(holed[~hole], x[~hole], atol=2.5)
+    assert np.isnan(_enlarged(np.full((5, 7), np.nan))).all()

@@ -271,3 +271,11 @@ def test_an_expired_calibration_is_exit_status_3_and_its_age_and_covariance_are_
     with (folder / "run.yaml").open("a") as file:
         file.write("recorded: 2025-07-02\n")
     assert checked(folder)[1] == 0
+    assert "(today)" not in checked(folder)[0]
+
+
+def test_a_calibration_of_a_day_to_come_is_a_remark(folder):
+    with (folder / "rig.yaml").open("a") as file:
+        file.write("calibration: {date: 2999-01-02, verdict: PASS}\n")
+    for path in (folder, folder / "rig.yaml"):
+        assert "rig.yaml: calibration.date: 2999-01-02 is after" in checked(path)[0]

@@ -107,10 +107,20 @@ def in_millimetres(rig: Rig, cameras: tuple[str, ...], screens: tuple[str, ...])
     return replace(rig, cameras={**rig.cameras, **changed}, screens={**rig.screens, **others})
 
 
+def with_sizes(rig: Rig, **sizes: tuple[float, float]) -> Rig:
+    return replace(rig, screens={**rig.screens, **{n: replace(rig.screens[n], size_m=s) for n, s in sizes.items()}})
+
+
 @pytest.mark.parametrize(
     ("rig", "words"),
     [
         (unequal_fan(), []),
+        (with_sizes(unequal_fan(), left=(40.0, 30.0)), []),
+        (with_sizes(unequal_fan(), left=(4000.0, 3000.0)), ["size_m of `left`"]),
+        (
+            with_sizes(in_millimetres(unequal_fan(), (), ("left", "right")), left=(4000.0, 3000.0)),
+            ["world_from_screen of `left`, `right` and size_m of `left`"],
+        ),
         (far_away(unequal_fan(), 4e6), []),
         (in_millimetres(unequal_fan(), ("left",), ()), ["camera_from_world of `left`"]),
         (in_millimetres(unequal_fan(), ("left", "right"), ()), ["camera_from_world of `left`, `right`"]),

@@ -132,6 +132,14 @@ def test_the_light_of_the_room_may_change():
     assert false < 0.3
 
 
+@pytest.mark.parametrize("pictures", [6, 15, 40])
+def test_the_means_of_noise_scatter_as_stated(pictures):
+    noise = np.random.default_rng(pictures).normal(LEVEL, NOISE, (pictures, 200, 300)).astype(np.float32)
+    for passed in (False, True):
+        scatter = [float(mean.var()) * pictures / NOISE**2 for mean in mean_pictures.means_of(list(noise), passed)]
+        assert scatter == pytest.approx([mean_pictures.LOWER_VARIANCE, mean_pictures.MIDDLE_VARIANCE], rel=0.1)
+
+
 def test_constant_light_is_constant_though_the_noise_of_a_picture_is_in_the_mean_that_contains_it():
     """Texture fainter than the noise, in large pictures, which measure their light precisely."""
     rng, size = np.random.default_rng(2), (720, 960)

@@ -43,6 +43,23 @@ def test_rates_are_the_derivatives():
     np.testing.assert_allclose(found[:, 3:], turned[9:-9], atol=5e-3)
 
 
+def test_an_interpolated_pose_and_a_rate_depend_on_the_samples_around_them_alone():
+    t = np.arange(12) * 0.1
+    known = exact(t)
+    between, on = np.array([0.52]), 5
+    for k in range(len(t)):
+        position = known.position_m.copy()
+        position[k] += 1.0
+        covariance = known.covariance.copy()
+        covariance[k] += np.eye(6)
+        other = PoseSeries(t, known.rotation, position, covariance)
+        there = interpolate(other, between)
+        assert bool(np.any(there.position_m != interpolate(known, between).position_m)) == (4 <= k <= 7)
+        assert bool(there.covariance.any()) == (k == 5)  # of the nearest
+        moved = np.abs(rates(other)[on] - rates(known)[on]).max() > 1e-12
+        assert bool(moved) == (k in (2, 3, 4, 6, 7, 8))
+
+
 def test_a_motion_needs_content_and_rising_times():
     with pytest.raises(ValueError, match="attitudes, positions"):
         PoseSeries(np.arange(3.0), None, None, np.zeros((3, 6, 6)))

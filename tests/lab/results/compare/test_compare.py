@@ -16,7 +16,7 @@ from geometry.arrays import Array
 from lab.errors import InputError
 from lab.files.run.results import SUMMARY_SCHEMA
 from lab.files.text import columns
-from lab.results.compare import UNDETERMINED, alignment_rows, compare, read_reference
+from lab.results.compare import UNDETERMINED, _still, alignment_rows, compare, read_reference
 from lab.results.compare_page import DIFFERENCES, compare_and_write
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
 from tracking.comparison.frame_alignment import PoseSeries
@@ -192,6 +192,19 @@ def test_a_stationary_stand_gets_allan_deviations_and_no_time_offset(folder):
     assert float(rows[0]["deviation_deg"]) == pytest.approx(np.rad2deg(1e-4), rel=0.15)
     assert float(rows[0]["low_deg"]) < np.rad2deg(1e-4) < float(rows[0]["high_deg"])
     assert "Allan deviation" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize("axis", [0, 2])  # yaw, and roll: pitch ends at 90 deg
+def test_a_stand_at_half_a_turn_is_as_still_as_one_that_is_not_turned(axis):
+    angles = np.random.default_rng(1).normal(0, 1e-4, (600, 3))
+    found = []
+    for turn in (0.0, np.pi):
+        R = rotations.matrix_from_ypr(angles + turn * np.eye(3)[axis])
+        still = _still(PoseSeries(np.arange(600) * 0.01, R, np.zeros((600, 3)), np.tile(1e-8 * np.eye(6), (600, 1, 1))))
+        assert still is not None
+        assert [name for name, _ in still.of_result] == ["yaw", "pitch", "roll"]
+        found.append([allan.deviation for _, allan in still.of_result])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
 
 
 def test_a_reference_of_another_motion_is_reported_as_not_fitting(folder, result):

@@ -171,6 +171,7 @@ def test_cameras_that_are_moved_during_a_recording_are_named_and_the_sigmas_cont
     assert found.max() < 6.0
     for camera in summary["parameters"]["noise"]:
         assert any(note.startswith(f"{camera}: the camera moves by") and "once" in note for note in summary["notes"])
+    assert not any("Find out when" in note for note in summary["notes"])  # the finding says when
     assert summary["verdict"]["status"] == "check"
     named = {e["numbers"]["camera"]: e["numbers"] for e in summary["verdict"]["evidence"] if e["code"] == "BP-V19"}
     assert {name: n["moved_px"] for name, n in named.items()} == pytest.approx(
