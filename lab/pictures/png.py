@@ -199,7 +199,8 @@ def _reverse_paeth_of_three(row: Bytes, above: Bytes, decoded: Bytes) -> None:
 
 
 @compiled_for_threads
-def _paeth(difference: int, left: int, up: int, corner: int) -> int:
+def _paeth(difference: np.uint8, left: np.int64, up: np.int64, corner: np.int64) -> np.int64:
+    """A byte from the difference to its prediction."""
     from_left, from_up = up - corner, left - corner
     to_left, to_up, to_corner = abs(from_left), abs(from_up), abs(from_left + from_up)
     nearest = up if to_up <= to_corner else corner

@@ -89,10 +89,10 @@ LOOKS_PX, LOOK_SIDE_PX, LOOK_CELLS = (20.0, 32.0), 64, 4
 CALIBRATION = (1.64, 2.22, 0.2, -7.07)
 GROWTH = 0.07  # of the log of the diameter per log of the enlargement, which blurs: median of the same pictures
 # A rim with nearly the grey value of what is behind it is not seen, only the edge of the inside: before clouds, where
-# they differ by less than 15 DN, diameters were 20 % too small. So each drogue is shown once more with STRETCH times
-# the contrast about the middle between the rim and what is beside it (WITHIN and BESIDE, radii); its log diameter is
-# the mean of both. RMS error of the log diameter of 142 drogues of the third renderer and 115 of the training's: .116
-# and .111 before, .113 and .106 with STRETCH 2, .120 and .121 with 4. Drogues look larger by STRETCH_GROWTH: .023, .019.
+# they differ by less than 15 DN, diameters are 8 to 20 % too small. So each drogue is shown once more with STRETCH
+# times the contrast about the middle between the rim and what is beside it (WITHIN and BESIDE, radii); its log diameter
+# is the mean of both. RMS error of the log diameter of 142 drogues of the third renderer and 115 of the training's:
+# .116 and .111 before, .112 and .107 with 2, .116 and .121 with 3. They look larger by STRETCH_GROWTH: .023 and .019.
 STRETCH, STRETCH_GROWTH, WITHIN, BESIDE = 2.0, 0.02, (0.9, 1.0), (1.1, 1.3)
 
 

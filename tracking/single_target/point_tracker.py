@@ -163,8 +163,8 @@ _UNUSUAL_AREA, _UNUSUAL_SHARE, _FIRST_AREA_SIGMA = 2.0, 0.05, 0.05
 # Without it, the estimated sigma is three quarters of the true one, and twice as many areas are unusual.
 _LIMITED_SHARE = 0.78
 _SHAPE_RATE = 0.02  # least rate of the mean shape, which growth does not change: a slow occlusion is not usual with it
-# Correlation of the shift of a target that is hidden in part with that of the frame before: the side changes as something
-# narrow passes. With .8 to .95 the means over 20 recordings are alike; a strip that passes slowly needs .8.
+# Correlation of the shift of a target that is hidden in part with that of the frame before: the side changes as
+# something narrow passes. With .8 to .95 the means over 20 recordings are alike; a strip that passes slowly needs .8.
 _SAME_SIDE = 0.8
 _STEADY = 3  # frames after which the area of a target that was lost is that of all of it
 _POSITION = np.diag([1.0, 1.0, 0.0, 0.0])  # the part of the state
@@ -225,8 +225,7 @@ class PointTracker:
         self._speed = 0.0  # px/frame, the largest so far
         self._growth = 1.0  # of the acceleration while the target is not seen
         self._flux = float("nan")  # running mean of the target's brightness
-        # Covariance of the state with the direction in which the centroid of what is seen of the target is shifted: that
-        # of one picture is that of the next.
+        # Covariance of the state with the direction in which the centroid of what is seen of the target is shifted.
         self._P_shift = np.zeros((4, 2))
         self._area: _Usual | None = None  # of the area's logarithm
         self._shape: _Usual | None = None  # of the logarithm of the shorter over the longer axis
