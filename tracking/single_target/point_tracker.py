@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, symmetric
 from geometry.uncertainty.chi_square import chi2_limit
 from tracking import kalman
 from tracking.detections import UNMATCHED, Detections
@@ -158,12 +158,39 @@ _FLUX_RATE = 0.1  # of the running means of the target's brightness and of its a
 # An area that differs by more sigmas than this is that of a part of the target, or of the target and something beside
 # it. What is hidden makes it smaller: a small area changes the mean twenty times as slowly. The first sigma is of the
 # logarithm.
-_UNUSUAL_AREA, _UNUSUAL_RATE, _FIRST_AREA_SIGMA = 2.0, 0.05 * _FLUX_RATE, 0.05
+_UNUSUAL_AREA, _UNUSUAL_SHARE, _FIRST_AREA_SIGMA = 2.0, 0.05, 0.05
 # Squares of areas that are weighted and limited like this have this share of their variance (normal distribution).
 # Without it, the estimated sigma is three quarters of the true one, and twice as many areas are unusual.
 _LIMITED_SHARE = 0.78
+_SHAPE_RATE = 0.02  # least rate of the mean shape, which growth does not change: a slow occlusion is not usual with it
+# Correlation of the shift of a target that is hidden in part with that of the frame before: the side changes as
+# something narrow passes. With .8 to .95 the means over 20 recordings are alike; a strip that passes slowly needs .8.
+_SAME_SIDE = 0.8
 _STEADY = 3  # frames after which the area of a target that was lost is that of all of it
 _POSITION = np.diag([1.0, 1.0, 0.0, 0.0])  # the part of the state
+
+
+@dataclass(frozen=True, slots=True)
+class _Usual:
+    """A number of the target in most pictures: running mean and variance, and how much the next one changes them."""
+
+    mean: float
+    variance: float
+    rate: float = 0.5
+
+    def differs(self, away: float) -> bool:
+        """Whether a number that is so far from the mean is unusual."""
+        return abs(away) > _UNUSUAL_AREA * self.variance**0.5
+
+    def after(self, away: float, least_rate: float) -> _Usual:
+        """With one more number that is so far from the mean."""
+        most = _UNUSUAL_AREA * self.variance**0.5
+        rate = _UNUSUAL_SHARE * least_rate if self.differs(away) else self.rate
+        return _Usual(
+            self.mean + (_FLUX_RATE if away > most else rate) * max(away, -most),
+            self.variance + rate * (min(abs(away), most) ** 2 / _LIMITED_SHARE - self.variance),
+            self.rate if self.differs(away) else max(self.rate / (1 + self.rate), least_rate),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,8 +225,10 @@ class PointTracker:
         self._speed = 0.0  # px/frame, the largest so far
         self._growth = 1.0  # of the acceleration while the target is not seen
         self._flux = float("nan")  # running mean of the target's brightness
-        # Of the area's logarithm: running mean and variance, and how much the next area changes them.
-        self._log_area, self._area_variance, self._area_rate = float("nan"), 0.0, 1.0
+        # Covariance of the state with the direction in which the centroid of what is seen of the target is shifted.
+        self._P_shift = np.zeros((4, 2))
+        self._area: _Usual | None = None  # of the area's logarithm
+        self._shape: _Usual | None = None  # of the logarithm of the shorter over the longer axis
         # The area's logarithm before the target was lost, and frames since then in which its area is steady.
         self._lost_log_area, self._steady = float("nan"), 0
         self.in_part = False  # the last picture shows the target in part, or not at all
@@ -218,6 +247,7 @@ class PointTracker:
             self._unseen += dt
             return NOTHING if found is None else self._acquire(found)
         self._x, self._P = kalman.predict(self._x, self._P, dt, np.asarray(self._sigma_a * self._growth))
+        self._P_shift = _SAME_SIDE**dt * kalman.transition(dt) @ self._P_shift
         predicted, self._unseen = self._x[:2].copy(), self._unseen + dt
         row, nis, near = None, float("nan"), False
         if found is not None:
@@ -227,7 +257,7 @@ class PointTracker:
             # Without what an unusual area adds to the sigmas: a target that starts to move may change its area, too.
             self._learn(nis if near else float("nan"))
             if row is not None:
-                nis = self._update(found, cov[row] + self._hidden_px2(found, row, beside) * np.eye(2), row)
+                nis = self._update(found, cov[row], self._hidden_px2(found, row, beside) ** 0.5, row)
                 return self._estimate(PoseStatus.MEASURED, predicted, nis, row)
         self.in_part = found is not None
         self._growth = min(self._growth * (NEAR_MISS_GROWTH if near else MISS_GROWTH) ** dt, MOST_GROWTH)
@@ -244,14 +274,16 @@ class PointTracker:
         self._waited = 0.0
         if steps is None:
             return NOTHING
-        if np.isfinite(self._log_area):
-            self._lost_log_area = self._log_area
+        if self._area is not None:
+            self._lost_log_area = self._area.mean
+        self._P_shift = np.zeros((4, 2))
         if np.isfinite(self._lost_log_area) and np.isfinite(self._flux):  # found again: it may still be hidden in part
             more = [_shift_px2(self._lost_log_area, min(s.flux / self._flux, 2.0)) for s in steps]
             steps = tuple(replace(s, P=s.P + m * _POSITION) for s, m in zip(steps, more, strict=True))
+            self._P_shift = more[-1] ** 0.5 * np.eye(4, 2)
         last = steps[-1]
         self._x, self._P, self.acquired = last.x, last.P, steps
-        self._unseen, self._growth, self._log_area, self._steady = 0.0, 1.0, float("nan"), 0
+        self._unseen, self._growth, self._area, self._steady = 0.0, 1.0, None, 0
         fluxes = [s.flux for s in steps if np.isfinite(s.flux)]
         self._flux = float(np.mean(fluxes)) if fluxes else self._flux
         return self._estimate(PoseStatus.MEASURED, np.full(2, np.nan), float("nan"), last.row)
@@ -261,34 +293,45 @@ class PointTracker:
 
         beside: the picture before or after this one shows it so: this one may, by less than the area's scatter.
         An edge that hides a share s of a disc with the radius r moves its centroid by .85 to 1 times s r. The area is
-        flux over peak, which the light does not change.
+        flux over peak, which the light does not change. What is left of a disc is shorter by the share s along one
+        axis, which a target that grows meanwhile does not change.
         """
         area = float(found.flux[row] / found.peak[row]) if found.peak[row] > 0 else float("nan")
-        if not area > 0 or np.isnan(self._log_area):
-            self._log_area = float(np.log(area)) if area > 0 else float("nan")
-            self._area_variance, self._area_rate = _FIRST_AREA_SIGMA**2, 0.5
-            known = np.isfinite(self._log_area) and np.isfinite(self._lost_log_area)
+        ratio = float(found.minor_px[row] / found.major_px[row]) if found.major_px[row] > 0 else float("nan")
+        if not area > 0 or self._area is None:
+            self._area = _Usual(float(np.log(area)), _FIRST_AREA_SIGMA**2) if area > 0 else None
+            self._shape = _Usual(float(np.log(ratio)), _FIRST_AREA_SIGMA**2) if ratio > 0 else None
+            known = self._area is not None and np.isfinite(self._lost_log_area)
             return _shift_px2(self._lost_log_area, area / np.exp(self._lost_log_area)) if known else 0.0
-        usual, away = self._log_area, float(np.log(area)) - self._log_area
-        most = _UNUSUAL_AREA * self._area_variance**0.5
-        rate = _UNUSUAL_RATE if abs(away) > most else self._area_rate
-        self._log_area += (_FLUX_RATE if away > most else rate) * max(away, -most)
-        self._area_variance += rate * (min(abs(away), most) ** 2 / _LIMITED_SHARE - self._area_variance)
-        self.in_part = abs(away) > most
-        if not self.in_part:
-            self._area_rate = max(self._area_rate / (1 + self._area_rate), _FLUX_RATE)
+        usual, away = self._area, float(np.log(area)) - self._area.mean
+        self.in_part, seen = usual.differs(away), float(np.exp(away))
+        if self._shape is not None and ratio > 0:
+            flatter = float(np.log(ratio)) - self._shape.mean
+            if flatter < 0 and self._shape.differs(flatter):
+                self.in_part, seen = True, min(seen, float(np.exp(flatter)))
+            self._shape = self._shape.after(flatter, _SHAPE_RATE)
+        self._area = usual.after(away, _FLUX_RATE)
         if np.isfinite(self._lost_log_area) and self._steady < _STEADY:
             self._steady = 0 if self.in_part else self._steady + 1
             return _shift_px2(self._lost_log_area, area / np.exp(self._lost_log_area))
         if not (self.in_part or beside):
             return 0.0
-        return _shift_px2(usual, np.exp(away), 0.0 if self.in_part else self._area_variance)
+        return _shift_px2(usual.mean, seen, 0.0 if self.in_part else usual.variance)
 
-    def _update(self, found: Detections, cov: Array, row: int) -> float:
-        """The state with a detection that has this covariance (2, 2). Returns its normalised innovation squared."""
+    def _update(self, found: Detections, cov: Array, shift_px: float, row: int) -> float:
+        """The state with a detection that has this covariance (2, 2). Returns its normalised innovation squared.
+
+        shift_px: sigma of the shift of its centroid, which is much the same in successive pictures, so that the mean of
+        many is hardly better: its direction is considered, not estimated. Source: Schmidt 1966.
+        """
         assert self._x is not None
-        nis = float(kalman.innovation(self._x, self._P, found.uv_px[row], cov)[2])
-        self._x, self._P = kalman.update(self._x, self._P, found.uv_px[row], cov)
+        P, common = self._P, self._P_shift + shift_px * np.eye(4, 2)
+        S = P[:2, :2] + cov + shift_px * (self._P_shift[:2] + common[:2].T)
+        y = found.uv_px[row] - self._x[:2]
+        K = np.linalg.solve(S, (P[:, :2] + shift_px * self._P_shift).T).T
+        nis = float(y @ np.linalg.solve(S, y))
+        self._x, self._P = self._x + K @ y, symmetric(P - K @ S @ K.T)
+        self._P_shift = self._P_shift - K @ common[:2]
         flux = float(found.flux[row])
         if np.isfinite(flux):
             self._flux = flux if np.isnan(self._flux) else (1 - _FLUX_RATE) * self._flux + _FLUX_RATE * flux

@@ -213,6 +213,27 @@ def test_no_frame_of_an_occlusion_is_off_by_more_than_its_sigmas_say(px_per_fram
     assert max(ratios) < 6
 
 
+@pytest.mark.parametrize("slow", [25, 50])
+def test_a_target_that_grows_while_an_edge_slowly_hides_a_part_of_it_is_off_by_no_more_than_its_sigmas_say(slow):
+    """Its area stays as usual; what is left of it is flatter. A part that stays hidden shifts all pictures alike."""
+    rng, found, centres = np.random.default_rng(8), [], []
+    for k in range(80 + 2 * slow):
+        centres.append(np.array([75.0 + 12 * np.sin(k / 11), 60.0 + 8 * np.sin(k / 14)]))
+        radius, part = 6.0 * (1 + 0.003 * k), min(max(k - 35, 0) / slow, max(2 * slow + 55 - k, 0) / slow, 1.0)
+        begin = radius * (1 - 0.8 * part)
+        picture = disc_behind_an_edge(centres[-1], radius, (begin, begin + 100))
+        noisy = np.clip(np.round(picture + 2 * rng.standard_normal(picture.shape)), 0, 255).astype(np.uint8)
+        found.append(find_blobs(noisy, BlobParameters("darker")))
+    ratios = []
+    for estimate, centre in zip(track_point(steps(len(found)), found), centres, strict=True):
+        if estimate.status is PoseStatus.MEASURED:
+            away = estimate.x[:2] - centre
+            ratios.append(np.sqrt(away @ np.linalg.solve(estimate.P[:2, :2], away)))
+    assert len(ratios) > 45
+    assert max(ratios) < 6
+    assert np.sqrt(np.mean(np.square(ratios)) / 2) < 1.5
+
+
 @pytest.mark.parametrize("fastest", [4.0, 15.0])
 def test_a_target_whose_area_changes_as_it_starts_to_move_is_followed(fastest):
     rng, tracker, u, statuses = np.random.default_rng(3), PointTracker(), 100.0, []
