@@ -27,7 +27,7 @@ STAGES = (
     ("detect", "lab.runs.frames.pipeline", "Pipeline._detect"),
     ("track", "tracking.rigid_body.rigid_tracker", "RigidTracker.step"),
     ("smooth", "lab.runs.smoothing_pass", "smooth"),
-    ("smooth", "tracking.smoothing.smoother", "Smoothed.frame"),
+    ("smooth", "tracking.smoothing.smoothed", "Smoothed.frame"),
     ("tables", "lab.runs.tables", "TableWriter.write"),
     ("tables", "lab.runs.tables", "TableWriter.__exit__"),
     ("model check", "lab.runs.model_check.check", "check_sampled_frames"),

@@ -33,7 +33,8 @@ from lab.runs.frames.moments import Moment
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.model_check.frame_sampler import FrameSampler
 from tracking.smoothing.recording import EstimatedClocks, FoundClocks, TrackedRecording
-from tracking.smoothing.smoother import Smoothed, smooth
+from tracking.smoothing.smoothed import Smoothed
+from tracking.smoothing.smoother import smooth
 
 MOST_PASSES = 4  # causal ones
 SETTLED = 0.1  # of the prior's sigma: a smaller correction does not need another causal pass

@@ -19,7 +19,8 @@ from tracking.detections import UNMATCHED, Detections
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.smoothing.recording import TrackedRecording
-from tracking.smoothing.smoother import Smoothed, smooth
+from tracking.smoothing.smoothed import Smoothed
+from tracking.smoothing.smoother import smooth
 from tracking.statuses import PoseStatus, TrackedFrame
 
 START = 10  # number of frames until the velocities are known

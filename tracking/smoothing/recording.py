@@ -243,7 +243,7 @@ class TrackedRecording:
 # are ordinary tracking. Where a few spots allow two poses, the two directions agree only on the right one. Source:
 # ours; forward and backward tracks as in two-filter smoothing.
 
-MIN_FRAMES = 2  # a shorter stretch is left to the smoother, which bounds it from both sides
+MIN_FRAMES = 2  # a shorter stretch after the first frame is left to the smoother, which bounds it from both sides
 DISAGREEMENT_CHI2 = 36.0  # of 6 degrees of freedom: poses of the two directions farther apart are different answers
 
 
@@ -264,7 +264,7 @@ def track_backward(rec: TrackedRecording, motion: SmoothedMotion, weak: Bools, s
     """
     out = BackwardLabels(len(rec), len(rec.model))
     for first, end in true_ranges(weak):
-        if end - first >= MIN_FRAMES and end < len(rec) and sure[end]:
+        if (end - first >= MIN_FRAMES or first == 0) and end < len(rec) and sure[end]:
             _track_stretch(rec, motion, first, end - 1, out)
     return out
 

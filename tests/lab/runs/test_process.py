@@ -36,7 +36,7 @@ from tests.lab.run_folders import write_run
 from tests.paths import ROOT
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.rigid_body.rigid_tracker import RigidTracker
-from tracking.smoothing.smoother import Smoothed
+from tracking.smoothing.smoothed import Smoothed
 from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame
 
 CAUSAL_FILES = (

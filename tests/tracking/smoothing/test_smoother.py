@@ -30,7 +30,8 @@ from tests.tracking.rigid_runs import (
 from tracking.detections import UNMATCHED
 from tracking.parameters import TrackerParameters
 from tracking.smoothing.recording import TrackedRecording
-from tracking.smoothing.smoother import Smoothed, smooth
+from tracking.smoothing.smoothed import Smoothed
+from tracking.smoothing.smoother import smooth
 from tracking.statuses import PoseStatus, SpotStatus, TrackedFrame
 
 Passes = tuple[PointRun, list[TrackedFrame], list[TrackedFrame], Smoothed]
