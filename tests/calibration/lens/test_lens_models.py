@@ -9,6 +9,7 @@ from calibration.lens.fit.lens_fit import robust_fit
 from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, folds_in_picture, rational_of_fisheye
 from calibration.lens.fit.lens_parameters import AS_STATED, values_of
 from calibration.lens.fit.lens_start import board_poses, start
+from calibration.lens.fit.model_selection import PLAUSIBLE
 from calibration.lens.fit.projection_map import difference, projection_map
 from calibration.lens.intrinsics import calibrate_intrinsics
 from geometry.arrays import Array
@@ -35,6 +36,24 @@ def test_a_model_that_folds_in_the_picture_is_not_chosen():
         folding = [c for c in selection.candidates if c.fit and folds_in_picture(c.fit.lens, c.model.fisheye, SIZE)]
         assert selection.chosen not in folding
         assert all("folds" in c.refused for c in folding)
+
+
+def test_boards_in_the_middle_of_the_picture_give_a_plausible_lens_and_its_focal_length():
+    """Every model folds beyond the boards or leaves directions unknown; one without coefficients is improbable."""
+    lens = (760.0, 761.0, 639.5, 511.5, 0.1, -0.25, 0.0, 0.0)
+    near = Scene(
+        lens, views=25, sigma_px=0.08, distance_m=(0.9, 1.4), at_most=0.15, columns=4, rows=3, square_m=0.054
+    )
+    z, unusable = [], 0
+    for seed in range(100, 106):
+        c = calibrate_intrinsics(photographs(near, seed))
+        if all(k.refused for k in c.selection.candidates):
+            unusable += 1
+            assert c.selection.chosen.probability >= PLAUSIBLE
+            assert c.model.coefficients > 0
+        z.append((c.fit.lens[0] - lens[0]) / c.sigmas[0])
+    assert unusable > 3
+    assert np.max(np.abs(z)) < 3
 
 
 def test_the_weak_prior_on_a_rational_lens_does_not_move_a_wide_one():
