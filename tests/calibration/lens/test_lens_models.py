@@ -43,9 +43,7 @@ def test_a_model_that_folds_in_the_picture_is_not_chosen():
 def test_boards_in_the_middle_of_the_picture_give_a_plausible_lens_and_its_focal_length():
     """Every model folds beyond the boards or leaves directions unknown; one without coefficients is improbable."""
     lens = (760.0, 761.0, 639.5, 511.5, 0.1, -0.25, 0.0, 0.0)
-    near = Scene(
-        lens, views=25, sigma_px=0.08, distance_m=(0.9, 1.4), at_most=0.15, columns=4, rows=3, square_m=0.054
-    )
+    near = Scene(lens, views=25, sigma_px=0.08, distance_m=(0.9, 1.4), at_most=0.15, columns=4, rows=3, square_m=0.054)
     z, unusable = [], 0
     for seed in range(100, 106):
         c = calibrate_intrinsics(photographs(near, seed))
