@@ -179,9 +179,11 @@ def _choose(judged: Sequence[_Judged]) -> ModelSelection:
         why = f"its directions have the smallest expected error where corners were seen ({chosen.error_px:.2g} px)"
     else:
         folding = {j.candidate.model for j in solved if j.folds}
-        distorting = [c for c in done.values() if c.probability >= PLAUSIBLE and c.model.coefficients > 0]
+        # Without coefficients, a lens is stated to be known where no corner was seen.
+        distorting = [c for c in done.values() if c.model.coefficients > 0] or list(done.values())
         chosen = min(
-            distorting or done.values(), key=lambda c: (c.model in folding, c.error_px > UNKNOWN_PX, c.error_px)
+            distorting,
+            key=lambda c: (c.model in folding, c.probability < PLAUSIBLE, c.error_px > UNKNOWN_PX, c.error_px),
         )
         why = "every model folds or leaves directions unknown; this one has the smallest error where corners were seen"
     return ModelSelection(out, chosen, "as requested" if len(judged) == 1 else why)

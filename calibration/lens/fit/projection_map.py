@@ -2,8 +2,9 @@
 
 A small rotation of the camera and a change of its lens have similar effects, and the camera's pose is always solved for
 with the same lens afterwards. So every change is compared after the rotation of the camera that minimises its sum of
-squares over the picture. mrcal does this through the board poses ("A tour of mrcal", sections on projection
-uncertainty and on differencing); the uniform weight over the picture is ours.
+squares over the picture, or over the part where corners were seen: a rotation that also fits where none were turns the
+directions that are known. mrcal does this through the board poses ("A tour of mrcal", sections on projection
+uncertainty and on differencing); the uniform weight over the pixels is ours.
 """
 
 from __future__ import annotations
