@@ -14,6 +14,7 @@ fixed by wide priors instead of by three chosen points.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc
@@ -263,9 +264,10 @@ def _points(
 def _direction_sigma_px(table: CornerTable, found: LensFit) -> float:
     """Median sigma of directions where corners were seen, from noise and the scatter between photographs."""
     equations = ViewEquations.of(table, found, AS_STATED)
-    at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
+    seen = partial(seen_at, table, found.used)
+    at = projection_map(found.model, found.lens, table.image_size_px, 1.0, where=seen)
     sigmas = at.sigma_px(scattered(found, equations, equations.scatter()))
-    return float(np.nanmedian(sigmas[seen_at(table, found.used, at.pixels)]))
+    return float(np.nanmedian(sigmas[seen(at.pixels)]))
 
 
 def _p_of_points(table: CornerTable, found: LensFit, factor: float, used: Bools) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -215,7 +216,8 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     spread = equations.scatter()
     noise = spread.factor if spread.is_significant else 1.0
     distance = options.distance_m or _typical_depth(table, found)
-    pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance)
+    seen = partial(seen_at, table, found.used)
+    pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance, where=seen)
     covariance = scattered(found, equations, spread) + _by_unsolved_board(table, found, shape, options)
     model_uncertainty = estimate_model_uncertainty(table, found, selection, pixel_map, covariance, noise)
     odd = np.arange(len(equations.views)) % 2 == 1

@@ -211,32 +211,36 @@ def with_picture_noise(table: CornerTable, found: LensFit) -> CornerTable:
     """The table with the noise of each corner by that of the picture; None where the residuals do not show it.
 
     Corners have the noise of the picture, which is large where squares are small, edges wide or markers near; and that
-    of all other causes, which is the same for all. The shares of both have the maximum likelihood, without the corners
-    that are outliers if they are right: the fit may have rejected others, with the noise of most.
+    of all other causes, which is the same for all. The shares of both have the maximum likelihood over all corners,
+    also those that the fit rejects: with the noise of most, it rejects just the noisy ones, and the others do not show
+    how noise differs. What is an outlier in any case has the density of a corner at the gate.
     """
     same = replace(table, picture_noise=None)
     if table.sigmas_px is None:
         return same
-    length2, used = np.nan_to_num(np.sum(found.residuals**2, axis=1), nan=np.inf), found.used
     own2 = (table.sigmas_px / np.median(table.sigmas_px)) ** 2
+    there = np.isfinite(found.residuals).all(axis=1)
+    length2 = np.sum(found.residuals[there] ** 2, axis=1)
+    outlier = 2 * np.log(np.mean(np.sum(found.residuals[found.used] ** 2, axis=1)) / 2) + CORNER_GATE**2
 
     def variance(common: float) -> Array:
         return np.asarray(common + (1 - common) * own2)
 
     def deviance(common: float) -> float:
-        w = variance(common)[used]
-        return 2 * float(np.sum(np.log(w)) + len(w) * np.log(np.mean(length2[used] / w)))
+        w, used = variance(common)[there], found.used[there]
+        for _ in range(_ROUNDS):
+            v = w * np.mean((length2 / w)[used]) / 2
+            one_by_one = 2 * np.log(v) + length2 / v
+            before, used = used, one_by_one < outlier
+            if np.array_equal(before, used):
+                break
+        return float(np.sum(np.minimum(one_by_one, outlier)))
 
-    for _ in range(_ROUNDS):
-        common = float(minimize_scalar(deviance, bounds=(0.0, 1.0), method="bounded").x)
-        if chdtrc(1, max(deviance(1.0) - deviance(common), 0.0)) >= _NOISE_DIFFERS:
-            return same
-        score = length2 / variance(common)
-        before, used = used, score < CORNER_GATE**2 * np.mean(score[used]) / 2
-        if np.array_equal(before, used):
-            break
+    common = float(minimize_scalar(deviance, bounds=(0.0, 1.0), method="bounded").x)
+    if chdtrc(1, max(deviance(1.0) - deviance(common), 0.0)) >= _NOISE_DIFFERS:
+        return same
     noise = np.sqrt(variance(common))
-    return replace(table, picture_noise=noise / np.median(noise[used]))
+    return replace(table, picture_noise=noise / np.median(noise[found.used]))
 
 
 def with_view_noise(table: CornerTable, found: LensFit) -> CornerTable:

@@ -6,15 +6,16 @@ leave, which grows with the coefficients, and the difference to the other models
 these are right. The chosen model has the smallest sum where corners were seen, and leaves no part of the picture
 unknown; of models with about the same sum, it is of the more probable kind, perspective or fisheye. The sum is the
 variance of Bayesian model averaging (Hoeting et al. 1999, Statistical Science 14) about one of the models, with
-probabilities from the errors in held-out photographs (Yao et al. 2018, Bayesian Analysis 13, pseudo averaging), whose
-noise is raised by the scatter between photographs. Its use as a criterion is ours, after the focused information
-criterion (Claeskens and Hjort 2003, JASA 98).
+probabilities from the density that each photograph has as predicted by the others (Yao et al. 2018, Bayesian Analysis
+13, pseudo averaging), with their noise raised by the scatter between photographs. Its use as a criterion is ours, after
+the focused information criterion (Claeskens and Hjort 2003, JASA 98).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc
@@ -150,11 +151,10 @@ def _choose(judged: Sequence[_Judged]) -> ModelSelection:
     if not solved:
         reasons = "; ".join(f"{j.candidate.model.title}: {j.candidate.refused}" for j in judged)
         raise AdjustmentError(f"no lens model can be used ({reasons})")
-    best = min(solved, key=lambda j: j.held_out_px2)
-    assert best.candidate.fit is not None
+    best = min(solved, key=lambda j: j.deviance(j.noise_px))
     # One factor for all models: a rich model takes up a part of the scatter between few photographs.
     raised = max(1.0, best.scatter)
-    score = np.array([j.held_out_px2 for j in solved]) / (best.candidate.fit.sigma_px * raised) ** 2
+    score = np.array([j.deviance(best.noise_px * raised) for j in solved])
     weights = np.exp(-(score - score.min()) / 2)
     weights /= weights.sum()
     done = {}
@@ -179,7 +179,12 @@ def _choose(judged: Sequence[_Judged]) -> ModelSelection:
         why = f"its directions have the smallest expected error where corners were seen ({chosen.error_px:.2g} px)"
     else:
         folding = {j.candidate.model for j in solved if j.folds}
-        chosen = min(done.values(), key=lambda c: (c.model in folding, c.error_px > UNKNOWN_PX, c.error_px))
+        # Without coefficients, a lens is stated to be known where no corner was seen.
+        distorting = [c for c in done.values() if c.model.coefficients > 0] or list(done.values())
+        chosen = min(
+            distorting,
+            key=lambda c: (c.model in folding, c.probability < PLAUSIBLE, c.error_px > UNKNOWN_PX, c.error_px),
+        )
         why = "every model folds or leaves directions unknown; this one has the smallest error where corners were seen"
     return ModelSelection(out, chosen, "as requested" if len(judged) == 1 else why)
 
@@ -193,12 +198,20 @@ class _Judged:
     inside: Bools | None = None  # (rows, columns): corners were seen there
     scatter: float = 1.0  # between photographs, factor on the sigmas
     scatters: bool = False  # whether it is significant
-    held_out_px2: float = np.inf  # sum of squared errors of all photographs, each predicted without it
+    noise_px: float = np.nan  # of a corner's coordinate
+    coordinates: int = 0  # of all corners, less those that the poses of the boards take up
+    predicted: tuple[float, float] = (np.inf, 0.0)  # see ViewEquations.predicted; chi-square in units of noise_px
     sigma_px: float = np.nan  # of directions where corners were seen
     unknown_px: float = np.inf  # of directions in 90 % of the picture
     stated_px: float = np.inf  # the same with the scatter between photographs, as it will be stated
     folds: bool = False
     overfit: float = 1.0  # RMS error in held-out photographs over the noise of the corners
+
+    def deviance(self, noise_px: float) -> float:
+        """Minus twice the log density of all photographs, each predicted by the others, with this noise of corners."""
+        chi2, log_determinants = self.predicted
+        ratio2 = (noise_px / self.noise_px) ** 2
+        return chi2 / ratio2 + self.coordinates * np.log(noise_px**2) + log_determinants
 
     def refused(self, raised: float, model_error_px: float) -> str:
         """Reason why the model cannot be chosen; empty if it can. raised: factor on the sigmas."""
@@ -223,8 +236,9 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
     except AdjustmentError as error:
         return _Judged(replace(candidate, refused=f"the views do not determine it: {error}"))
     C = equations.solution()[1][: equations.lens, : equations.lens]
-    at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
-    inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
+    seen = partial(seen_at, table, found.used)
+    at = projection_map(found.model, found.lens, table.image_size_px, 1.0, where=seen)
+    inside = seen(at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     variance = np.trace(at.covariance_px2(C)[inside], axis1=-2, axis2=-1)
     spread = equations.scatter()
     stated = scattered(found, equations, spread)
@@ -234,7 +248,9 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
         inside=inside,
         scatter=spread.factor,
         scatters=spread.is_significant,
-        held_out_px2=float(np.sum(equations.held_out_px2() * equations.count)) * found.sigma_px**2,
+        noise_px=found.sigma_px,
+        coordinates=int(equations.count.sum()),
+        predicted=equations.predicted(),
         sigma_px=float(np.sqrt(_common_mean(variance))) if inside.any() else np.inf,
         unknown_px=float(np.nanquantile(at.sigma_px(C), 0.9)),
         stated_px=float(np.nanquantile(at.sigma_px(stated), 0.9)),

@@ -2,19 +2,21 @@
 
 A small rotation of the camera and a change of its lens have similar effects, and the camera's pose is always solved for
 with the same lens afterwards. So every change is compared after the rotation of the camera that minimises its sum of
-squares over the picture. mrcal does this through the board poses ("A tour of mrcal", sections on projection
-uncertainty and on differencing); the uniform weight over the picture is ours.
+squares over the picture, or over the part where corners were seen: a rotation that also fits where none were turns the
+directions that are known. mrcal does this through the board poses ("A tour of mrcal", sections on projection
+uncertainty and on differencing); the uniform weight over the pixels is ours.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtrc
 
 from calibration.lens.fit.lens_models import LensModel, fold_r2, undistorted
-from geometry.arrays import Array
+from geometry.arrays import Array, Bools
 from geometry.camera import project_points_full
 
 
@@ -50,9 +52,17 @@ class ProjectionMap:
 
 
 def projection_map(
-    model: LensModel, lens: Array, image_size_px: tuple[int, int], distance_m: float, columns: int = 32
+    model: LensModel,
+    lens: Array,
+    image_size_px: tuple[int, int],
+    distance_m: float,
+    columns: int = 32,
+    where: Callable[[Array], Bools] | None = None,
 ) -> ProjectionMap:
-    """The map of a lens (18,), with `columns` points across the picture from border to border."""
+    """The map of a lens (18,), with `columns` points across the picture from border to border.
+
+    where: of pixels (rows, columns, 2), those for which the rotation is the best one; None: all.
+    """
     width, height = image_size_px
     rows = max(2, round(columns * height / width))
     u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, columns), np.linspace(-0.5, height - 0.5, rows))
@@ -66,7 +76,10 @@ def projection_map(
     by_lens = np.concatenate([seen.d_pinhole, seen.d_distortion], axis=-1)[..., model.free]
     # A rotation by omega moves the ray x by omega x x: d(pixel) = D (omega x x) = (x x D_row) . omega.
     by_turn = np.cross(rays[:, None, :], seen.d_point)
-    A, B = by_turn[good].reshape(-1, 3), by_lens[good].reshape(-1, by_lens.shape[-1])
+    known = good & where(pixels).ravel() if where is not None else good
+    if not known.any():
+        known = good
+    A, B = by_turn[known].reshape(-1, 3), by_lens[known].reshape(-1, by_lens.shape[-1])
     left = by_lens - by_turn @ np.linalg.lstsq(A, B, rcond=None)[0]
     left[~good] = np.nan
     # The screen faces the camera: its points are distance_m (x, y, 1), and d_point at z = 1 is the derivative by x, y.

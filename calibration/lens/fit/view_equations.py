@@ -169,6 +169,18 @@ class ViewEquations:
             error[v] = (self.chi2[v] + 2 * g @ y + y @ S @ y) / self.count[v]
         return error
 
+    def predicted(self) -> tuple[float, float]:
+        """Chi-square of all views, each as predicted by the others, and the log of the determinants that it lacks.
+
+        The sum is minus twice the log of their probability density, but for a constant. The covariance of the
+        residuals r of a view is I + J (I - S)^-1 J', with S = J'J, where the others predict it. At the solution of all,
+        r is that of the prediction times the inverse of this covariance.
+        """
+        left = (1 + _UNDETERMINED) * np.eye(len(self.basis)) - self.information
+        moved = np.linalg.solve(left, self.gradient[..., None])[..., 0]
+        chi2 = float(np.sum(self.chi2) + np.sum(self.gradient * moved))
+        return chi2, -float(np.sum(np.linalg.slogdet(left)[1]))
+
     def scattered_covariance(self, spread: Scatter) -> Array:
         """Covariance (q, q) of the unknowns from noise and, where it is significant, from the scatter of photographs.
 

@@ -440,7 +440,7 @@ def _uncertainty(r: Intrinsics) -> Section:
     drawings = [
         PageDrawing(
             heat_map(r.map.sigma_px(r.covariance), extent, "Uncertainty of a pixel's direction", "px"),
-            "1 sigma along the worst direction, after the best-fitting small rotation of the camera.",
+            "1 sigma along the worst direction, after the rotation of the camera that fits where corners were seen.",
         ),
         PageDrawing(
             heat_map(r.map.sigma_mm(r.covariance), extent, f"The same on a screen {at}", "mm"),

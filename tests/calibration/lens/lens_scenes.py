@@ -33,6 +33,7 @@ class Scene:
     rows: int = 6
     square_m: float = 0.03
     size_px: tuple[int, int] = SIZE
+    at_most: float = 0.45  # of the board's middle from the picture's, in widths and heights
 
 
 def board_points(scene: Scene) -> Array:
@@ -57,7 +58,8 @@ def photographs(scene: Scene, seed: int) -> CornerTable:
     while len(views) < scene.views:
         R = exp(rng.uniform(-1, 1, 3) * [scene.tilt_rad, scene.tilt_rad, scene.roll_rad] + [*scene.lean_rad, 0.0])
         z = rng.uniform(*scene.distance_m)
-        at = np.array([rng.uniform(-0.45, 0.45) * width / fx * z, rng.uniform(-0.45, 0.45) * height / fy * z, z])
+        u, v = rng.uniform(-scene.at_most, scene.at_most, 2)
+        at = np.array([u * width / fx * z, v * height / fy * z, z])
         t = at - R @ middle
         if np.any(points @ R[2] + t[2] <= 0.02):
             continue

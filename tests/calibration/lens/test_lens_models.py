@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -9,11 +10,13 @@ from calibration.lens.fit.lens_fit import robust_fit
 from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, folds_in_picture, rational_of_fisheye
 from calibration.lens.fit.lens_parameters import AS_STATED, values_of
 from calibration.lens.fit.lens_start import board_poses, start
+from calibration.lens.fit.model_selection import PLAUSIBLE
 from calibration.lens.fit.projection_map import difference, projection_map
-from calibration.lens.intrinsics import calibrate_intrinsics
+from calibration.lens.intrinsics import Intrinsics, IntrinsicsOptions, calibrate_intrinsics
 from geometry.arrays import Array
 from geometry.rotations import exp
 from tests.calibration.lens.lens_scenes import SIZE, TRUTH, WIDE, Scene, photographs
+from tests.calibration.lens.random_lenses import within_boards
 
 
 def lens_of(numbers: tuple[float, ...]) -> Array:
@@ -35,6 +38,22 @@ def test_a_model_that_folds_in_the_picture_is_not_chosen():
         folding = [c for c in selection.candidates if c.fit and folds_in_picture(c.fit.lens, c.model.fisheye, SIZE)]
         assert selection.chosen not in folding
         assert all("folds" in c.refused for c in folding)
+
+
+def test_boards_in_the_middle_of_the_picture_give_a_plausible_lens_and_its_focal_length():
+    """Every model folds beyond the boards or leaves directions unknown; one without coefficients is improbable."""
+    lens = (760.0, 761.0, 639.5, 511.5, 0.1, -0.25, 0.0, 0.0)
+    near = Scene(lens, views=25, sigma_px=0.08, distance_m=(0.9, 1.4), at_most=0.15, columns=4, rows=3, square_m=0.054)
+    z, unusable = [], 0
+    for seed in range(100, 106):
+        c = calibrate_intrinsics(photographs(near, seed))
+        if all(k.refused for k in c.selection.candidates):
+            unusable += 1
+            assert c.selection.chosen.probability >= PLAUSIBLE
+            assert c.model.coefficients > 0
+        z.append((c.fit.lens[0] - lens[0]) / c.sigmas[0])
+    assert unusable > 3
+    assert np.max(np.abs(z)) < 3
 
 
 def test_the_weak_prior_on_a_rational_lens_does_not_move_a_wide_one():
@@ -70,6 +89,27 @@ def test_the_map_excludes_rotations_of_the_camera():
     # This rotation compensates for a shift of cx by 1 px.
     turn = exp(np.array([0.0, -1.0 / 20000, 0.0]))
     assert (turn @ [0, 0, 1])[0] * 20000 + 641 == pytest.approx(640, abs=1e-6)
+
+
+def test_directions_where_corners_were_seen_are_as_uncertain_as_after_the_best_rotation_there():
+    """Eight coefficients leave the corners of the picture open, and a rotation that fits there turns the middle."""
+    true = rational_of_fisheye(lens_of((400.0, 401, 624, 511, 0.02, -0.005)), np.deg2rad(62))
+    scene = Scene(tuple(true[:12]), views=8, sigma_px=0.03, tilt_rad=0.6, distance_m=(0.12, 0.25), at_most=0.2)
+    for seed in range(2):
+        c = calibrate_intrinsics(photographs(scene, seed), IntrinsicsOptions(lens=LensModel(8)))
+        seen = within_boards(c, c.map.pixels.reshape(-1, 2)).reshape(c.map.pixels.shape[:2])
+        rays = c.map.rays[seen]
+
+        def pixels(turn: Array, rays: Array = rays, c: Intrinsics = c) -> Array:
+            out = cv2.projectPoints(rays[:, None], turn, np.zeros(3), c.matrix, np.array(c.distortion))[0]
+            return np.asarray(out).ravel()
+
+        by_turn = np.stack([(pixels(d) - pixels(-d)) / 2e-5 for d in 1e-5 * np.eye(3)], axis=1)
+        rows = c.map.by_parameter[seen].reshape(len(by_turn), -1)
+        aligned = rows - by_turn @ np.linalg.lstsq(by_turn, rows, rcond=None)[0]
+        stated, least = (np.sqrt(np.trace(A @ c.covariance @ A.T) / len(rays)) for A in (rows, aligned))
+        assert least <= stated * 1.001
+        assert stated < 1.05 * least
 
 
 def test_sigmas_on_the_screen_are_those_in_the_picture_times_the_distance_over_the_focal_length():

@@ -6,6 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
+from scipy.stats import multivariate_normal
 
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_fit import LensFit, fit, robust_fit
@@ -45,6 +47,27 @@ def test_a_view_held_out_is_predicted_as_by_a_fit_without_it():
     without = fit(table, found.used & (table.view != 3), found.model, found.values, AS_STATED)
     change = (without.lens - found.lens)[found.model.free]
     assert equations.moved(change).chi2[3] / equations.count[3] == pytest.approx(equations.held_out_px2()[3], rel=0.02)
+
+
+def test_views_have_the_density_that_the_others_predict():
+    """Five views of a linear model, each with six unknowns of its own, whose priors are flat."""
+    rng = np.random.default_rng(3)
+    view = np.repeat(np.arange(5), 8)
+    shared, own, residuals = (rng.normal(size=(40, 2, k)) for k in (3, 6, 1))
+    equations = ViewEquations.of_rows(shared, own, residuals[..., 0], view, np.arange(5), np.zeros((0, 3)), 3)
+    change, _ = equations.solution()
+    J, left = [], []  # of each view, in directions that its own unknowns do not reach
+    for v in range(5):
+        N = null_space(own[view == v].reshape(-1, 6).T).T
+        J.append(N @ shared[view == v].reshape(-1, 3))
+        left.append(N @ residuals[view == v].ravel())
+    density = 0.0
+    for v in range(5):
+        A, y = (np.concatenate([x for u, x in enumerate(xs) if u != v]) for xs in (J, left))
+        C = np.linalg.inv(A.T @ A)
+        predicted = multivariate_normal(J[v] @ C @ A.T @ y, np.eye(len(J[v])) + J[v] @ C @ J[v].T)
+        density += -2 * predicted.logpdf(left[v]) - len(J[v]) * np.log(2 * np.pi)
+    assert sum(equations.moved(change).predicted()) == pytest.approx(density, rel=1e-6)
 
 
 def test_the_bend_follows_without_a_fit_in_which_it_is_free():

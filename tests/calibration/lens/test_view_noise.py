@@ -80,3 +80,20 @@ def test_noise_of_other_causes_alone_leaves_all_corners_alike():
     table = photographs(Scene(views=10, sigma_px=0.2), 6)
     sigmas = np.random.default_rng(9).uniform(0.001, 0.01, len(table))
     assert calibrate_intrinsics(replace(table, sigmas_px=sigmas), FIVE).table.picture_noise is None
+
+
+def test_noise_of_the_picture_is_found_where_the_fit_rejects_the_noisy_corners():
+    """With equal noise a third of the noisy corners are outliers; the others do not show that noise differs."""
+    squares = []
+    for seed in range(6):
+        table = photographs(Scene(views=5, sigma_px=0.0, columns=4, rows=3, square_m=0.05), 20 + seed)
+        rng = np.random.default_rng([seed, 10])
+        sigmas = np.where(np.arange(len(table)) % 5 == 0, 0.5, 0.07)
+        table = replace(table, pixels=table.pixels + sigmas[:, None] * rng.normal(size=(len(table), 2)))
+        c = calibrate_intrinsics(replace(table, sigmas_px=sigmas), replace(FIVE, warp=False))
+        noisy = sigmas > 0.1
+        assert c.table.noise[noisy].mean() > 3 * c.table.noise[~noisy].mean()
+        assert c.fit.used[noisy].mean() > 0.9
+        squares.append((errors(c) / c.sigmas) ** 2)
+    # The mean of 54 squared numbers, which are correlated: within .4 to 2 with a probability of 99 %.
+    assert 0.4 < np.mean(squares) < 2
