@@ -26,6 +26,7 @@ from tracking.setup_mistakes.evidence import (
     LEAST_POINTS,
     Comparison,
     Frames,
+    Invisible,
     compare,
     invisible_mistakes,
 )
@@ -201,17 +202,18 @@ def hidden_by_symmetry(run: Run, statistics: RunStatistics) -> tuple[Finding, ..
         return ()
     prior = PosePrior.everywhere(run.rig) if run.prior is None else run.prior
     hidden = invisible_mistakes(run.rig, prior, run.tracker.labels, statistics.first_pose)
-    return tuple(
-        finding(
-            "BP-M10",
-            Level.WARN,
-            f"the recording does not show whether {one.mistake.what}; the first poses would then be wrong by"
-            f" {format_number(one.off_m)} m, {format_number(one.off_deg)} deg",
-            remedy=f"To exclude it, {SHOWN_BY[one.mistake.kind]}; then make the prior in run.yaml so narrow that it"
-            " excludes the other first pose, or give one known pose in truth/pose.csv.",
-        )
-        for one in hidden
-        if not one.is_harmless
+    return tuple(not_shown(one, "the recording") for one in hidden if not one.is_harmless)
+
+
+def not_shown(one: Invisible, recording: str) -> Finding:
+    """The finding on a mistake that a recording does not show."""
+    return finding(
+        "BP-M10",
+        Level.WARN,
+        f"{recording} does not show whether {one.mistake.what}; the first poses would then be wrong by"
+        f" {format_number(one.off_m)} m, {format_number(one.off_deg)} deg",
+        remedy=f"To exclude it, {SHOWN_BY[one.mistake.kind]}; then make the prior in run.yaml so narrow that it"
+        " excludes the other first pose, or give one known pose in truth/pose.csv.",
     )
 
 

@@ -39,6 +39,7 @@ from lab.calibrate.refine.recordings import (
     tolerant,
     with_rig,
 )
+from lab.calibrate.refine.symmetry import NOISY, P_CHANGE, hidden_mistakes
 from lab.calibrate.step import Solved, Step, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.camera_file import require_valid_calibration
@@ -207,7 +208,8 @@ def _refined(
     except AdjustmentError as error:
         raise CalibrationError(f"the rig cannot be refined by these recordings: {error}") from None
     checks = tuple(r.check(refined.rig, refined.covariance) for r in second)
-    return RefinedRig(refined, prior, tuple(second), checks)
+    hidden = hidden_mistakes(rig, prior, second, stacks)
+    return RefinedRig(refined, prior, tuple(second), checks, hidden)
 
 
 def _figures(r: Refinement) -> str:
@@ -253,7 +255,6 @@ def _write_residuals(result: RefinedRig, path: Path) -> None:
 # Findings and report of a refinement.
 
 
-P_CHANGE = 1e-4  # p-value below which the stated sigmas do not explain the changes
 P_HELD_OUT = 1e-4  # p-value, of all held-out recordings together, below which they contradict the result
 FEW_USED = 0.5  # share of a recording's frames that are used, below which it is reported
 # Codes of the model check that no refined rig may have: a fault, unexplained or correlated residuals.
@@ -268,6 +269,7 @@ class RefinedRig:
     prior: RigCovariance
     runs: tuple[LabelledRun, ...]
     checks: tuple[ModelCheck, ...]  # of each run with the refined rig
+    hidden: tuple[Finding, ...] = ()  # mistakes that the runs do not show
 
 
 def refine_findings(result: RefinedRig) -> tuple[Finding, ...]:
@@ -280,15 +282,13 @@ def refine_findings(result: RefinedRig) -> tuple[Finding, ...]:
         *_used(result),
         *_held(r.given, result.prior),
         *_lenses(r),
+        *result.hidden,
     ]
     noisy = {name: factor for name, factor in r.noise.items() if factor > NOISY}
     for name, factor in noisy.items():
         what = f"the spots of camera `{name}` scatter {format_number(factor, 2)} times as much as their sigmas state"
         out.append(finding("BP-M04", Level.WARN, what))
     return tuple(out)
-
-
-NOISY = 1.5  # the limit of the model check
 
 
 def _changes(r: Refinement) -> list[Finding]:
