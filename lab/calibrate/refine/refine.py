@@ -34,12 +34,12 @@ from lab.calibrate.refine.recordings import (
     SHUTTER,
     LabelledRun,
     free_group,
+    hidden_mistakes,
     labelled,
     stated_covariance,
     tolerant,
     with_rig,
 )
-from lab.calibrate.refine.symmetry import NOISY, P_CHANGE, hidden_mistakes
 from lab.calibrate.step import Solved, Step, run_step, state_of
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.camera_file import require_valid_calibration
@@ -56,6 +56,7 @@ from lab.report.calibration.calibration_drawings import correlation_matrix, resi
 from lab.report.calibration.calibration_scene import SceneObject, Trail, frustum_length, rig_things, scene_views
 from lab.report.page import KeyFigure, PageDrawing, PageTable, Section, cell
 from lab.runs.model_check.check import ModelCheck, with_place_errors
+from lab.runs.model_check.symmetry import NOISY, P_CHANGE
 from lab.runs.process import process_run
 
 RIG, RESIDUALS = "rig.yaml", "residuals.csv"
