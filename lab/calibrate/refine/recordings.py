@@ -284,9 +284,10 @@ def hidden_mistakes(
             if poses is None or at_s is None:
                 out.setdefault(one.mistake.what, not_shown(one, run.name))
                 continue
-            k, i = (int(np.argmin(np.abs(t_s - at_s))) for t_s in (other.t_s, poses.t_s))
+            i = int(np.argmin(np.abs(poses.t_s - at_s)))
             true = Pose(matrix_from_quaternion(poses.quaternion_wxyz[i]), poses.position_m[i])
-            off = [np.linalg.norm(true.minus(r.poses[k])) for r in (other, given.recording)]
+            near = (r.poses[int(np.argmin(np.abs(r.t_s - at_s)))] for r in (other, given.recording))
+            off = [np.linalg.norm(true.minus(pose)) for pose in near]
             if off[0] < off[1]:
                 what = f"{run.name}: {one.mistake.what}: only without this the poses agree with truth/pose.csv"
                 out[one.mistake.what] = finding("BP-M06", Level.FAIL, what, remedy=sentence(one.mistake.remedy))

@@ -56,7 +56,6 @@ from lab.report.calibration.calibration_drawings import correlation_matrix, resi
 from lab.report.calibration.calibration_scene import SceneObject, Trail, frustum_length, rig_things, scene_views
 from lab.report.page import KeyFigure, PageDrawing, PageTable, Section, cell
 from lab.runs.model_check.check import ModelCheck, with_place_errors
-from lab.runs.model_check.symmetry import NOISY, P_CHANGE
 from lab.runs.process import process_run
 
 RIG, RESIDUALS = "rig.yaml", "residuals.csv"
@@ -256,6 +255,7 @@ def _write_residuals(result: RefinedRig, path: Path) -> None:
 # Findings and report of a refinement.
 
 
+P_CHANGE = 1e-4  # p-value below which the stated sigmas do not explain the changes
 P_HELD_OUT = 1e-4  # p-value, of all held-out recordings together, below which they contradict the result
 FEW_USED = 0.5  # share of a recording's frames that are used, below which it is reported
 # Codes of the model check that no refined rig may have: a fault, unexplained or correlated residuals.
@@ -290,6 +290,9 @@ def refine_findings(result: RefinedRig) -> tuple[Finding, ...]:
         what = f"the spots of camera `{name}` scatter {format_number(factor, 2)} times as much as their sigmas state"
         out.append(finding("BP-M04", Level.WARN, what))
     return tuple(out)
+
+
+NOISY = 1.5  # the limit of the model check
 
 
 def _changes(r: Refinement) -> list[Finding]:

@@ -24,9 +24,10 @@ from tracking.parameters import LabelParameters
 from tracking.setup_mistakes.evidence import Invisible, invisible_mistakes
 from tracking.setup_mistakes.possible import Mistake, PictureChange
 
-P_CHANGE = 1e-4  # p-value below which the stated sigmas do not explain the changes
-NOISY = 1.5  # residuals over their sigmas: the limit of the model check
 _FRAMES = 40  # of a recording, with which the rigs are compared
+_LESS_NATS = 7.0  # by which a rig may be less likely: of twenty pairs that mirror each other half of that at most
+_NOISIER = 1.2  # scatter with another rig over that with the given one
+_FITTING = 0.8  # share of the frames that another rig must explain: others may have a wrong label
 _LOST = 0.05  # share of the spots that may be outliers of the other rig
 _FARTHER = 1.5, 0.05  # times the motion from one frame to the next, and m, rad: the body moves about another point
 
@@ -81,12 +82,13 @@ class Recorded:
                 yield one, other
 
     def _without(self, mistake: Mistake) -> ModelCheckRecording | None:
-        """The recording as it is without a mistake, with other labels and poses; None where a frame does not fit."""
+        """The frames that fit without a mistake, with other labels and poses; None where many do not."""
         model, labelled = SpotModel.of(mistake.rig), SpotModel.of(self.rig)
         calibration, near = RigUncertainty(mistake.rig, model, self.covariance), self.prior
         recording = self.recording
         used = recording.usable
         poses: list[Pose] = []
+        rows: list[int] = []
         source = np.full((len(used), len(model)), NO_POINT)  # the view as whose spot a spot has been labelled
         for k in range(len(used)):
             views = {
@@ -95,18 +97,23 @@ class Recorded:
             found = {
                 name: Detections.at(recording.uv_px[k, of], recording.cov_px2[k, of]) for name, of in views.items()
             }
-            if k:
-                step = recording.poses[k].minus(recording.poses[k - 1])
+            if rows:
+                step = recording.poses[k].minus(recording.poses[rows[-1]])
                 size, turn = (_FARTHER[0] * float(np.linalg.norm(part)) + _FARTHER[1] for part in (step[:3], step[3:]))
                 near = PosePrior(poses[-1], size, turn)
             points = mistake.points([{}, found, {}])
             best = candidate_labellings(mistake.rig, model, points, near, self.parameters, calibration, most=1)
             if not best or np.count_nonzero(best[0].point_of != NO_POINT) < np.count_nonzero(used[k]):
-                return None
+                if not rows:
+                    return None
+                continue
+            rows.append(k)
             poses.append(best[0].fit.world_from_body)
             for v in np.flatnonzero(best[0].point_of != NO_POINT):
                 source[k, v] = views[_source(mistake, model.views[v][0])][best[0].point_of[v]]
-        return _relabelled(mistake, model, recording, source, Pose.stack(poses))
+        if len(rows) < _FITTING * len(used):
+            return None
+        return _relabelled(mistake, model, recording.at(np.array(rows)), source[rows], Pose.stack(poses))
 
 
 def _fit(
@@ -120,11 +127,17 @@ def _fit(
 
 
 def _as_good(one: Refinement | None, given: Refinement, recording: ModelCheckRecording) -> bool:
-    """Whether another rig explains a recording within the limits that a refinement has, and as well as the given."""
-    if one is None or one.p_change < min(P_CHANGE, given.p_change):
+    """Whether another rig within the stated sigmas explains a recording as well as the given one."""
+    if one is None or one.excluded - given.excluded > _LOST * recording.seen.sum():
         return False
-    noisier = max(one.noise[name] / given.noise[name] for name in given.noise)
-    return noisier < NOISY and one.excluded - given.excluded <= _LOST * recording.seen.sum()
+    noisier = max(one.noise.values()) / max(given.noise.values())
+    return noisier < _NOISIER and _misfit(one) < _misfit(given) + 2 * _LESS_NATS
+
+
+def _misfit(one: Refinement) -> float:
+    """Chi-square of the recordings and of the changes of the rig."""
+    white = one.before.excess(one.data)[0].white
+    return float(white @ white) + sum(d.rest for d in one.data)
 
 
 def _source(mistake: Mistake, camera: str) -> str:
