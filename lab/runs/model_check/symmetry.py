@@ -25,8 +25,7 @@ from tracking.setup_mistakes.evidence import Invisible, invisible_mistakes
 from tracking.setup_mistakes.possible import Mistake, PictureChange
 
 _FRAMES = 40  # of a recording, with which the rigs are compared
-_LESS_NATS = 7.0  # by which a rig may be less likely: of twenty pairs that mirror each other half of that at most
-_NOISIER = 1.2  # scatter with another rig over that with the given one
+_LESS_NATS = 4.0  # by which a rig may be less likely: of twenty that mirror the given one, the worst by 2.4
 _FITTING = 0.8  # share of the frames that another rig must explain: others may have a wrong label
 _LOST = 0.05  # share of the spots that may be outliers of the other rig
 _FARTHER = 1.5, 0.05  # times the motion from one frame to the next, and m, rad: the body moves about another point
@@ -111,8 +110,9 @@ class Recorded:
             poses.append(best[0].fit.world_from_body)
             for v in np.flatnonzero(best[0].point_of != NO_POINT):
                 source[k, v] = views[_source(mistake, model.views[v][0])][best[0].point_of[v]]
-        if len(rows) < _FITTING * len(used):
-            return None
+        same = (source[rows] == np.arange(len(model))) | (source[rows] == NO_POINT)
+        if len(rows) < _FITTING * len(used) or (same.all() and not mistake.pictures):
+            return None  # the stated sigmas of the same spots are what a refinement tests
         return _relabelled(mistake, model, recording.at(np.array(rows)), source[rows], Pose.stack(poses))
 
 
@@ -130,14 +130,14 @@ def _as_good(one: Refinement | None, given: Refinement, recording: ModelCheckRec
     """Whether another rig within the stated sigmas explains a recording as well as the given one."""
     if one is None or one.excluded - given.excluded > _LOST * recording.seen.sum():
         return False
-    noisier = max(one.noise.values()) / max(given.noise.values())
-    return noisier < _NOISIER and _misfit(one) < _misfit(given) + 2 * _LESS_NATS
+    return _misfit(one, given) < _misfit(given, given) + 2 * _LESS_NATS
 
 
-def _misfit(one: Refinement) -> float:
-    """Chi-square of the recordings and of the changes of the rig."""
+def _misfit(one: Refinement, given: Refinement) -> float:
+    """Chi-square of the recordings and of the changes of the rig, with the noise of the given one."""
     white = one.before.excess(one.data)[0].white
-    return float(white @ white) + sum(d.rest for d in one.data)
+    wider, usual = (r.correlation_frames * max(r.noise.values()) ** 2 for r in (one, given))
+    return float(white @ white) + wider / usual * sum(d.rest for d in one.data)
 
 
 def _source(mistake: Mistake, camera: str) -> str:
