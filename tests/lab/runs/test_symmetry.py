@@ -1,4 +1,4 @@
-"""A rig that is symmetric within its stated sigmas: what is hidden by this is reported, and nothing of other rigs is."""
+"""A rig that is symmetric within its stated sigmas: what this hides is reported, and nothing of other rigs is."""
 
 from __future__ import annotations
 
