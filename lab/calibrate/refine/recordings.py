@@ -291,7 +291,7 @@ def hidden_mistakes(
             if off[0] < off[1]:
                 what = f"{run.name}: {one.mistake.what}: only without this the poses agree with truth/pose.csv"
                 out[one.mistake.what] = finding("BP-M06", Level.FAIL, what, remedy=sentence(one.mistake.remedy))
-    return tuple(out.values())[:MOST_NAMED]
+    return tuple(sorted(out.values(), key=lambda f: -f.level)[:MOST_NAMED])
 
 
 def _time_in_both(t_s: Array, recording: ModelCheckRecording) -> float:
