@@ -310,7 +310,8 @@ def write_tables(
     # Where a light is too wide a spot is missing, and no mistake explains that better.
     named = any(f.code == quality.TOO_WIDE for f in verdict.findings)
     passes_all = verdict.status == "pass"
-    mistakes = () if named else mistakes_of_run(run, statistics, pictures, passes=passes_all, explained=explained)
+    samples = (pictures, sampler)
+    mistakes = () if named else mistakes_of_run(run, statistics, *samples, passes=passes_all, explained=explained)
     if mistakes:
         # The deviations of a rig with such a mistake are its consequences.
         others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings

@@ -16,7 +16,7 @@ from lab.findings.finding import Finding, Level, finding, sentence, verdict
 from lab.number_format import format_number
 from lab.pictures.source import video_at
 from lab.runs.frames.frames import WRITTEN_BY_DEFAULT, FrameSet
-from lab.runs.model_check.frame_sampler import BLOCK, EvenSampler
+from lab.runs.model_check.frame_sampler import BLOCK, EvenSampler, FrameSampler
 from lab.runs.verdict.run_statistics import RunStatistics
 from tracking.detections import Detections
 from tracking.setup_mistakes.evidence import (
@@ -26,6 +26,7 @@ from tracking.setup_mistakes.evidence import (
     LEAST_POINTS,
     Comparison,
     Frames,
+    Invisible,
     compare,
     invisible_mistakes,
 )
@@ -36,6 +37,7 @@ FRAMES = 2 * ENOUGH  # of a recording, with which mistakes are tested at most
 MOST_KEPT = 90  # frames from which they are chosen
 FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
 SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
+LEAST_SHOWN = 10  # numbers of the rig that a recording must show: four spots at rest agree with many rigs
 DOUBTFUL = 2  # pictures of a camera without any of its spots, from which on a run that passes is tested, too
 
 
@@ -159,7 +161,13 @@ def _parts_of_pictures(rig: Rig, names: Sequence[str], blocks: Sequence[Block]) 
 
 
 def mistakes_of_run(
-    run: Run, statistics: RunStatistics, pictures: SampledFrames, *, passes: bool, explained: bool = False
+    run: Run,
+    statistics: RunStatistics,
+    pictures: SampledFrames,
+    sampler: FrameSampler,
+    *,
+    passes: bool,
+    explained: bool = False,
 ) -> tuple[Finding, ...]:
     """Findings on mistakes in the set-up of a run that has been processed.
 
@@ -175,7 +183,7 @@ def mistakes_of_run(
     # Where the poses put no spot into a camera's pictures, its points are false ones.
     unused = [n for n in unused if cameras[n].expected or not statistics.measured]
     if passes and not unused and verdict(found) is not Level.FAIL:
-        return (*hidden_by_symmetry(run, statistics), *of_files)
+        return (*hidden_by_symmetry(run, statistics, sampler), *of_files)
     # Of a run, all pictures show whether a camera is used, not only the sampled ones; without any pose none is.
     others = [f for f in found if f.code != UNUSED]
     if verdict(found) is Level.FAIL or not statistics.measured:
@@ -195,23 +203,33 @@ def has_doubtful_pictures(statistics: RunStatistics) -> bool:
     return any(c.unlabelled + len(c.displaced) >= DOUBTFUL for c in statistics.cameras.values())
 
 
-def hidden_by_symmetry(run: Run, statistics: RunStatistics) -> tuple[Finding, ...]:
-    """Findings on mistakes with which another first pose within the prior explains a run without truth as well."""
+def hidden_by_symmetry(run: Run, statistics: RunStatistics, sampler: FrameSampler) -> tuple[Finding, ...]:
+    """Findings on mistakes with which another first pose within the prior explains a run without truth as well.
+
+    sampler: of the run's frames. Where the rig has a covariance, it may be another one within that.
+    """
     if statistics.first_pose is None or (run.folder / "truth" / "pose.csv").exists():
         return ()
-    prior = PosePrior.everywhere(run.rig) if run.prior is None else run.prior
-    hidden = invisible_mistakes(run.rig, prior, run.tracker.labels, statistics.first_pose)
-    return tuple(
-        finding(
-            "BP-M10",
-            Level.WARN,
-            f"the recording does not show whether {one.mistake.what}; the first poses would then be wrong by"
-            f" {format_number(one.off_m)} m, {format_number(one.off_deg)} deg",
-            remedy=f"To exclude it, {SHOWN_BY[one.mistake.kind]}; then make the prior in run.yaml so narrow that it"
-            " excludes the other first pose, or give one known pose in truth/pose.csv.",
-        )
-        for one in hidden
-        if not one.is_harmless
+    prior, parameters = PosePrior.everywhere(run.rig) if run.prior is None else run.prior, run.tracker.labels
+    every = invisible_mistakes(run.rig, prior, parameters, statistics.first_pose)
+    hidden = {one.mistake.what: one for one in every if not one.is_harmless}
+    if run.covariance is not None and (recording := sampler.recording()) is not None:
+        from lab.runs.model_check.symmetry import Recorded  # with the refinement: only with a covariance
+
+        given = Recorded.of(run.rig, run.covariance, run.prior, parameters, recording)
+        hidden |= {one.mistake.what: one for one, _ in given.hidden(least=LEAST_SHOWN)}
+    return tuple(not_shown(one, "the recording") for one in hidden.values())
+
+
+def not_shown(one: Invisible, recording: str) -> Finding:
+    """The finding on a mistake that a recording does not show."""
+    return finding(
+        "BP-M10",
+        Level.WARN,
+        f"{recording} does not show whether {one.mistake.what}; the first poses would then be wrong by"
+        f" {format_number(one.off_m)} m, {format_number(one.off_deg)} deg",
+        remedy=f"To exclude it, {SHOWN_BY[one.mistake.kind]}; then make the prior in run.yaml so narrow that it"
+        " excludes the other first pose, or give one known pose in truth/pose.csv.",
     )
 
 

@@ -346,14 +346,20 @@ class Invisible:
 
 
 def invisible_mistakes(
-    rig: Rig, prior: PosePrior | None, parameters: LabelParameters, first: Pose | None = None
+    rig: Rig,
+    prior: PosePrior | None,
+    parameters: LabelParameters,
+    first: Pose | None = None,
+    covariance: RigCovariance | None = None,
 ) -> Iterator[Invisible]:
     """The mistakes that a rig hides over the poses of a prior (without one: of a usual range).
 
     first: of a recording, to which the prior refers; then only this pose and one beside it are tried. Points have the
-    usual error of a calibrated rig as their sigma: a mistake that changes less is none.
+    usual error of a calibrated rig as their sigma: a mistake that changes less is none. covariance: of a rig that will
+    be refined: the points then fit to the errors that it allows, of each pose by themselves.
     """
     model, sigma_px = SpotModel.of(rig), parameters.model_sigma_px
+    calibration = None if covariance is None else RigUncertainty(rig, model, covariance)
     prior = assumed_range(rig) if prior is None else prior
     # A pose on the axis of symmetry is the same with the mistake; the one beside it shows whether others differ.
     beside = np.outer((0.0, *STEPS), BESIDE)
@@ -382,8 +388,8 @@ def invisible_mistakes(
             points = _detections(mistake, true, recorded[k], seen[k], sigma_px)
             if sum(map(len, points.values())) < max(parameters.min_spots, 1):
                 break
-            found = candidate_labellings(rig, model, points, near, parameters, most=1)
-            if not found or not _explains_all(found[0], points):
+            found = candidate_labellings(rig, model, points, near, parameters, calibration, most=1)
+            if not found or not _explains_all(found[0], points, calibration is not None):
                 break
             pose, fit = poses[int(k)], found[0].fit
             J = jacobian[k][seen[k]].reshape(-1, 6) / sigma_px
@@ -418,11 +424,12 @@ def _detections(
     return out
 
 
-def _explains_all(one: Labelling, points: dict[str, Detections]) -> bool:
-    """Whether every point has a label, and lies where the pose, which they determine, puts its spot."""
+def _explains_all(one: Labelling, points: dict[str, Detections], to_sigmas: bool) -> bool:
+    """Whether every point has a label, and lies where the pose, which they determine, puts its spot, or near it."""
     fit, labelled = one.fit, int(np.count_nonzero(one.point_of != NO_POINT))
     every = labelled == sum(map(len, points.values()))
-    return every and fit.dof > 0 and fit.observable and fit.rms_px < LARGEST_RMS_PX
+    fits = fit.consistent(P_FIT) if to_sigmas else fit.rms_px < LARGEST_RMS_PX
+    return every and fit.dof > 0 and fit.observable and fits
 
 
 def _off(fit: PoseFit, pose: Pose, covariance: Array) -> Array:

@@ -22,8 +22,10 @@ from calibration.model_check.linearised_frames import ModelCheckRecording, with_
 from calibration.terms.rig_blocks import BEAMS, CAMERAS, SCREENS
 from geometry.arrays import Array, finite, skew
 from geometry.forward_model import SpotModel
+from geometry.pose import Pose
 from geometry.pose_solver.visibility import assumed_range, poses_within
 from geometry.rig import Rig
+from geometry.rotations import matrix_from_quaternion
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import (
     CLOCK,
@@ -42,19 +44,22 @@ from geometry.uncertainty.rig_uncertainty import (
 from lab.errors import CalibrationError, InputError
 from lab.files.run.clocks import CameraClock, clocks_in
 from lab.files.run.run_file import Run
+from lab.files.run.truth import load_run_truth
 from lab.files.text.error_text import suggest_name
-from lab.findings.finding import Finding, Level
+from lab.findings.finding import Finding, Level, finding, sentence
 from lab.runs.frames.frames import FrameSet
 from lab.runs.frames.moments import Moment
 from lab.runs.frames.pipeline import FrameRecord, Frames, Pipeline
 from lab.runs.model_check.check import ModelCheck, check_model
 from lab.runs.model_check.frame_sampler import FrameSampler
+from lab.runs.model_check.symmetry import Recorded
 from lab.runs.setup_check import (
     SampledFrames,
     compared_with_mistakes,
     findings_of,
     has_doubtful_pictures,
     mistakes_by_themselves,
+    not_shown,
     unused_cameras,
     unused_finding,
 )
@@ -69,6 +74,7 @@ LEAST_MEASURED = 0.9  # share of frames with a measured pose, below which usual 
 _EXPECTED = 0.5
 _POSES = 2000  # of the prior, the one that shows most spots gives the size of the residuals
 _P_SPOT = 1e-6  # probability that a spot is farther from its prediction than its camera's stated errors allow
+MOST_NAMED = 3  # mistakes that the recordings do not show
 _IN_REACH = 0.5  # share of a camera's spots that have a point nearer: the others may be hidden
 
 
@@ -261,6 +267,37 @@ def _searched(run: Run, pictures: SampledFrames) -> tuple[tuple[Finding, ...], b
         return (), False
     found = tuple(f for f in findings_of(compared, run.rig) if f.level is Level.FAIL)
     return found, not found and not compared.given.is_certain
+
+
+def hidden_mistakes(
+    rig: Rig, prior: RigCovariance, runs: Sequence[LabelledRun], stacks: set[str]
+) -> tuple[Finding, ...]:
+    """Findings on mistakes that a run does not show; a pose in its truth decides."""
+    out: dict[str, Finding] = {}
+    for labelled in runs:
+        run = labelled.run
+        truth = load_run_truth(run)
+        poses = None if truth is None or truth.pose is None or not len(truth.pose.t_s) else truth.pose
+        at_s = None if poses is None else _time_in_both(poses.t_s, labelled.recording)
+        given = Recorded.of(rig, prior, run.prior, run.tracker.labels, labelled.in_views_of(rig), at_s)
+        for one, other in given.hidden(stacks):
+            if poses is None or at_s is None:
+                out.setdefault(one.mistake.what, not_shown(one, run.name))
+                continue
+            i = int(np.argmin(np.abs(poses.t_s - at_s)))
+            true = Pose(matrix_from_quaternion(poses.quaternion_wxyz[i]), poses.position_m[i])
+            near = (r.poses[int(np.argmin(np.abs(r.t_s - at_s)))] for r in (other, given.recording))
+            off = [np.linalg.norm(true.minus(pose)) for pose in near]
+            if off[0] < off[1]:
+                what = f"{run.name}: {one.mistake.what}: only without this the poses agree with truth/pose.csv"
+                out[one.mistake.what] = finding("BP-M06", Level.FAIL, what, remedy=sentence(one.mistake.remedy))
+    return tuple(sorted(out.values(), key=lambda f: -f.level)[:MOST_NAMED])
+
+
+def _time_in_both(t_s: Array, recording: ModelCheckRecording) -> float:
+    """The time of a known pose that is nearest to one of a frame with a pose."""
+    ours = recording.t_s[finite(recording.poses.translation, -1)]
+    return float(t_s[np.argmin(np.abs(t_s - ours[:, None]).min(axis=0, initial=np.inf))])
 
 
 # What is known of a rig before a refinement: the covariance of its file, and sigmas given for some of its parts.

@@ -34,6 +34,7 @@ from lab.calibrate.refine.recordings import (
     SHUTTER,
     LabelledRun,
     free_group,
+    hidden_mistakes,
     labelled,
     stated_covariance,
     tolerant,
@@ -207,7 +208,8 @@ def _refined(
     except AdjustmentError as error:
         raise CalibrationError(f"the rig cannot be refined by these recordings: {error}") from None
     checks = tuple(r.check(refined.rig, refined.covariance) for r in second)
-    return RefinedRig(refined, prior, tuple(second), checks)
+    hidden = hidden_mistakes(rig, prior, second, stacks)
+    return RefinedRig(refined, prior, tuple(second), checks, hidden)
 
 
 def _figures(r: Refinement) -> str:
@@ -268,6 +270,7 @@ class RefinedRig:
     prior: RigCovariance
     runs: tuple[LabelledRun, ...]
     checks: tuple[ModelCheck, ...]  # of each run with the refined rig
+    hidden: tuple[Finding, ...] = ()  # mistakes that the runs do not show
 
 
 def refine_findings(result: RefinedRig) -> tuple[Finding, ...]:
@@ -280,6 +283,7 @@ def refine_findings(result: RefinedRig) -> tuple[Finding, ...]:
         *_used(result),
         *_held(r.given, result.prior),
         *_lenses(r),
+        *result.hidden,
     ]
     noisy = {name: factor for name, factor in r.noise.items() if factor > NOISY}
     for name, factor in noisy.items():
