@@ -264,7 +264,7 @@ class _Smoother:
         """
         start = int(np.argmax(self.measured))
         jumped = self.motion.jumped.copy()
-        if not jumped[start + 1 : start + 2].any():
+        if not self.measured[start] or not jumped[start + 1 : start + 2].any():
             return False
         jumped[start + 1] = False
         for mask in (self.measured, self.sure, self.trusted, self.tracker_measured):
