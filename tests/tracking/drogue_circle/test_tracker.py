@@ -77,12 +77,12 @@ def test_the_coefficient_of_a_predicted_place_is_unknown_once_the_place_is():
 
 
 def basket(turned, seed):
-    """A dark disc of 40 px that shows no edge in two fifths of its rim, and is less dark in a share of it."""
+    """A black disc of 40 px that shows no edge in two fifths of its rim, and is lighter in a share of it."""
     y, x = np.mgrid[:120, :160] - np.array([60.0, 80.0])[:, None, None]
     theta, distance = np.arctan2(y, x), np.hypot(x, y)
     inside = norm.cdf((40.0 - distance) / BLUR_PX) * ((np.cos(5 * theta) < 0.3) | (distance < 25))
-    dark = BRIGHT - GREY - 50.0 * (np.abs(theta) < turned * np.pi)
-    return rounded(BRIGHT - dark * inside + np.random.default_rng(seed).normal(0, 2.0, x.shape))
+    contrast = BRIGHT - GREY - 50.0 * (np.abs(theta) < turned * np.pi)
+    return rounded(BRIGHT - contrast * inside + np.random.default_rng(seed).normal(0, 2.0, x.shape))
 
 
 @pytest.mark.parametrize("share", [0.33, 0.6])
