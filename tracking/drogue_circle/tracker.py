@@ -237,6 +237,9 @@ WHOLE = 0.85  # coverage of a rim that is seen whole
 _GATE_PX2 = 0.1**2 * np.eye(3)  # of the gate: a rim is not a perfect circle
 _WHOLE_GATE = 10.0  # factor of the innovation gate of such a rim
 _REFITS = 2  # without the sectors of an occluder
+# Share of the sectors that look different, above which a rim that shows as much as usual is that of a target that has
+# turned: its inside, which lies deeper, moves against the rim, and an occluder of so many sectors would hide the rim.
+_TURNED = 0.25
 _LEAST_RADIUS = 0.7  # of the smallest radius of an acquisition, below which a circle is not tracked
 
 
@@ -317,13 +320,15 @@ class Track:
     ) -> tuple[RimFit | None, float]:
         """The fit without the edges in sectors that an occluder hides: they pull the circle to one side."""
         gamma = self._coefficient(picture, *fit.circle)
+        least = p.min_coverage * self.habit.coverage  # of the rim that shows in clear frames
         for _ in range(_REFITS):
             hidden = self.appearance.hidden_sectors(*self.cells)
-            if not hidden.any():
+            turned = hidden.mean() > _TURNED and fit.coverage >= _USUAL * self.habit.coverage
+            if turned or not hidden.any():
                 break
             u, v, radius = fit.circle
             coarse = CircleCandidate(u, v, radius, 0.0, fit.polarity)
-            again = fit_rim(crop, coarse, p.min_coverage, hidden | self.habit.without_edge)
+            again = fit_rim(crop, coarse, least, hidden | self.habit.without_edge)
             if again is None:
                 return None, gamma
             still, fit = again.is_equal(fit), again

@@ -7,10 +7,10 @@ import pytest
 from scipy.stats import norm
 
 from tests.tracking.drogue_circle.discs import BLUR_PX, BRIGHT, GREY, covered, discs, rounded
-from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, classical_detector
+from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, Window, classical_detector
 from tracking.drogue_circle.printed import PrintedTracker
-from tracking.drogue_circle.rim_fit import SECTORS, Rim, RimFit
-from tracking.drogue_circle.tracker import CircleTracker, is_certain
+from tracking.drogue_circle.rim_fit import SECTORS, Rim, RimFit, fit_rim, smooth_crop
+from tracking.drogue_circle.tracker import CircleTracker, Track, is_certain
 from tracking.statuses import Cause, PoseStatus
 
 P = CircleParameters()
@@ -74,6 +74,30 @@ def test_the_coefficient_of_a_predicted_place_is_unknown_once_the_place_is():
     assert predicted[0].occlusion > 0.9
     assert not known[-1]
     assert known == sure or abs(sum(known) - sum(sure)) == 1  # the larger axis counts
+
+
+def basket(turned, seed):
+    """A black disc of 40 px that shows no edge in two fifths of its rim, and is lighter in a share of it."""
+    y, x = np.mgrid[:120, :160] - np.array([60.0, 80.0])[:, None, None]
+    theta, distance = np.arctan2(y, x), np.hypot(x, y)
+    inside = norm.cdf((40.0 - distance) / BLUR_PX) * ((np.cos(5 * theta) < 0.3) | (distance < 25))
+    contrast = BRIGHT - GREY - 50.0 * (np.abs(theta) < turned * np.pi)
+    return rounded(BRIGHT - contrast * inside + np.random.default_rng(seed).normal(0, 2.0, x.shape))
+
+
+@pytest.mark.parametrize("share", [0.33, 0.6])
+def test_a_target_whose_inside_has_turned_is_not_hidden_while_its_rim_shows_as_usual(share):
+    """Before, no frame was measured: too little of the rim was left beside the sectors that were taken for hidden."""
+    crop = smooth_crop(basket(0.0, seed=0), Window(80.0, 60.0, 80.0, 8.0, 30.0, 50.0), P.blur_px)
+    first = fit_rim(crop, CircleCandidate(80.0, 60.0, 40.0, 0.0, 1), P.min_coverage)
+    assert first is not None
+    track = Track.started(basket(0.0, seed=0), first, P)
+    for k in range(1, 25):
+        track.bank = track.bank.predicted(1.0)
+        fit, gamma = track.measure(basket(share * (k >= 20), seed=k), classical_detector(P), P)
+        assert fit is not None
+        assert np.hypot(fit.rim.u_px - 80, fit.rim.v_px - 60) < 0.3
+        track.update(fit, gamma, P)
 
 
 def test_a_second_equal_disc_does_not_take_over():
