@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc
@@ -236,9 +235,8 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
     except AdjustmentError as error:
         return _Judged(replace(candidate, refused=f"the views do not determine it: {error}"))
     C = equations.solution()[1][: equations.lens, : equations.lens]
-    seen = partial(seen_at, table, found.used)
-    at = projection_map(found.model, found.lens, table.image_size_px, 1.0, where=seen)
-    inside = seen(at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
+    at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
+    inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     variance = np.trace(at.covariance_px2(C)[inside], axis1=-2, axis2=-1)
     spread = equations.scatter()
     stated = scattered(found, equations, spread)
