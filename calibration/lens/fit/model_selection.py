@@ -3,7 +3,8 @@
 Residuals decrease with every coefficient, and held-out photographs share the board and its errors, so neither decides.
 What a lens is used for are directions. Their expected squared error has two parts: the variance that the photographs
 leave, which grows with the coefficients, and the difference to the other models, weighted with the probability that
-these are right. The chosen model has the smallest sum where corners were seen, and leaves no part of the picture
+these are right. The chosen model has the smallest sum where corners were seen, after the rotation of the camera that
+fits the whole picture: what a model leaves open beyond the corners turns them. It leaves no part of the picture
 unknown; of models with about the same sum, it is of the more probable kind, perspective or fisheye. The sum is the
 variance of Bayesian model averaging (Hoeting et al. 1999, Statistical Science 14) about one of the models, with
 probabilities from the density that each photograph has as predicted by the others (Yao et al. 2018, Bayesian Analysis
@@ -15,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc
@@ -236,9 +236,9 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
     except AdjustmentError as error:
         return _Judged(replace(candidate, refused=f"the views do not determine it: {error}"))
     C = equations.solution()[1][: equations.lens, : equations.lens]
-    seen = partial(seen_at, table, found.used)
-    at = projection_map(found.model, found.lens, table.image_size_px, 1.0, where=seen)
-    inside = seen(at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
+    # With the rotation that fits where corners were seen, models would be chosen that leave the rest open.
+    at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
+    inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     variance = np.trace(at.covariance_px2(C)[inside], axis1=-2, axis2=-1)
     spread = equations.scatter()
     stated = scattered(found, equations, spread)
