@@ -25,7 +25,6 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.visibility import assumed_range, poses_within
 from geometry.rig import Rig
-from geometry.rotations import matrix_from_quaternion
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import (
     CLOCK,
@@ -285,7 +284,7 @@ def hidden_mistakes(
                 out.setdefault(one.mistake.what, not_shown(one, run.name))
                 continue
             i = int(np.argmin(np.abs(poses.t_s - at_s)))
-            true = Pose(matrix_from_quaternion(poses.quaternion_wxyz[i]), poses.position_m[i])
+            true = Pose.from_quaternion(poses.quaternion_wxyz[i], poses.position_m[i])
             near = (r.poses[int(np.argmin(np.abs(r.t_s - at_s)))] for r in (other, given.recording))
             off = [np.linalg.norm(true.minus(pose)) for pose in near]
             if off[0] < off[1]:
