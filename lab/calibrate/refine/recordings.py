@@ -283,6 +283,8 @@ def hidden_mistakes(
             if poses is None or at_s is None:
                 out.setdefault(one.mistake.what, not_shown(one, run.name))
                 continue
+            if other is None:
+                continue
             i = int(np.argmin(np.abs(poses.t_s - at_s)))
             true = Pose.from_quaternion(poses.quaternion_wxyz[i], poses.position_m[i])
             near = (r.poses[int(np.argmin(np.abs(r.t_s - at_s)))] for r in (other, given.recording))

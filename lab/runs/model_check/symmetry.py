@@ -61,24 +61,28 @@ class Recorded:
 
     def hidden(
         self, stacks: Collection[str] = STACKS, least: int = 0
-    ) -> Iterator[tuple[Invisible, ModelCheckRecording]]:
+    ) -> Iterator[tuple[Invisible, ModelCheckRecording | None]]:
         """Mistakes without which another rig and another first pose fit as well, and the recording without them.
 
-        stacks: of the rig's numbers, those that are not as they are stated. least: of directions of these that
-        change the recording.
+        stacks: of the rig's numbers, those that are not as they are stated. least: of directions of these that must
+        change the recording if the rig as stated is not symmetric.
         """
         if not len(self.recording.seen):
             return
         given = None
         for one in invisible_mistakes(self.rig, self.prior, self.parameters, self.recording.poses[0], self.covariance):
-            other = None if one.is_harmless else self._without(one.mistake)
-            if other is None:
+            if one.is_harmless:
                 continue
-            given = given or _fit(self.rig, self.covariance, self.recording, stacks)
-            if given is None or len(given.data[0].y) < least:
-                return
-            if _as_good(_fit(one.mistake.rig, self.covariance, other, stacks), given, other):
-                yield one, other
+            other = self._without(one.mistake)
+            if not one.is_exact:
+                if other is None:
+                    continue
+                given = given or _fit(self.rig, self.covariance, self.recording, stacks)
+                if given is None or len(given.data[0].y) < least:
+                    return
+                if not _as_good(_fit(one.mistake.rig, self.covariance, other, stacks), given, other):
+                    continue
+            yield one, other
 
     def _without(self, mistake: Mistake) -> ModelCheckRecording | None:
         """The frames that fit without a mistake, with other labels and poses; None where many do not."""
