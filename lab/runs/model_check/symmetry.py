@@ -109,8 +109,9 @@ class Recorded:
             poses.append(best[0].fit.world_from_body)
             for v in np.flatnonzero(best[0].point_of != NO_POINT):
                 source[k, v] = views[changes[v].source][best[0].point_of[v]]
-        same = (source[rows] == np.arange(len(model))) | (source[rows] == NO_POINT)
-        if len(rows) < _FITTING * len(recording.seen) or (same.all() and not mistake.pictures):
+        as_recorded = np.array([camera not in mistake.pictures for camera, _ in model.views])
+        same = (as_recorded & (source[rows] == np.arange(len(model)))) | (source[rows] == NO_POINT)
+        if len(rows) < _FITTING * len(recording.seen) or same.all():
             return None  # the stated sigmas of the same spots are what a refinement tests
         clocks = recording.clock_s
         if clocks is not None:
