@@ -162,7 +162,7 @@ def _shown_by(background: NDArray[np.float32], count: Ints, light: Detections, s
 def _modulation(fits: Sequence[JointFit], seen: Exposures) -> Modulation | None:
     """The modulation of all lights of a camera: the most likely one, by errors with outliers, and the scatter.
 
-    That is known beforehand to be usual. Lights on even ground do not show the modulation, those on dark ground hardly.
+    That is known beforehand to be usual. Lights on even ground do not show the modulation, on unlit ground hardly.
     """
     share, variance = np.array([fit.shown for fit in fits]).reshape(-1, 2, 1).transpose(1, 0, 2)
     ratio = np.array([fit.level_dn / seen.usual_dn for fit in fits]).reshape(-1, 1)

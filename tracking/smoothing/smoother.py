@@ -264,10 +264,10 @@ class _Smoother:
         """
         start = int(np.argmax(self.measured))
         jumped = self.motion.jumped.copy()
-        if not jumped[start + 1 : start + 2].any():
+        if not self.measured[start] or not jumped[start + 1 : start + 2].any():
             return False
         jumped[start + 1] = False
-        for mask in (self.measured, self.sure, self.trusted, self.tracker_measured):
+        for mask in (self.measured, self.sure, self.trusted, self.rec.measured):  # of the causal tracker: the last
             mask[start] = False
         self.assigned[start] = -1
         self.motion = replace(self.motion, jumped=jumped)

@@ -177,7 +177,7 @@ def test_lights_that_pass_over_edges_show_the_modulation_and_how_unlike_their_pl
 
 
 @pytest.mark.parametrize("modulated", [0.0, 0.3])
-def test_lights_on_dark_ground_hardly_show_what_usual_ground_modulates(modulated):
+def test_lights_on_ground_of_low_light_hardly_show_what_usual_ground_modulates(modulated):
     """A tenth as bright as usual: what is expected before any light is seen must not count as seen."""
     side, usual_dn = 160, 25.0
     y, x = np.mgrid[:side, :side].astype(float)

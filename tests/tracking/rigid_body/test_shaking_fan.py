@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bench.random_scenes.answers import answers_in_memory
+from bench.random_scenes.families import family_scene
+from bench.random_scenes.judge import label_verdicts, nees_of
 from geometry.arrays import Ints
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
@@ -48,6 +51,16 @@ def test_a_fan_of_equal_angles_that_shakes_keeps_its_labels(axes):
         assert of.wrong == 0
         assert of.missed() == 0
         assert np.nanmax(of.nees) < 50
+
+
+def test_labels_of_a_first_frame_that_a_jump_alone_connects_with_the_others_are_those_of_the_others():
+    """Four beams of which one spot is outside the picture at the start; one spot off, the vehicle jumps by 6 cm."""
+    scene = family_scene("shaking-equal-fan", 1438)
+    answer = answers_in_memory(scene).smoothed
+    right, wrong, _ = label_verdicts(scene, answer)
+    assert right[0].any()
+    assert not wrong.any()
+    assert np.nanmax(nees_of(scene, answer)) < 50
 
 
 def test_an_update_far_from_its_prediction_finds_the_most_probable_pose():

@@ -187,13 +187,14 @@ class _Estimator:
         return Interpolation(self.ref, info, self.log_density, self._interior(out))
 
     def _interior(self, out: Interval) -> Bools:
-        """(T,): frames farther than twice the smoother's memory from any gap, jump or end."""
+        """(T,): frames farther than twice the smoother's memory from any gap, jump, end or frame with few spots."""
         info, _ = self._information(self.ref)
         share = np.einsum("kij,kji->k", out.pose_P, info.information)[self.measured]
         shown = share[share > 0]  # instants of frames with no spots of their own have none
         usual = float(np.median(shown)) * len(shown) / (6 * len(share)) if len(shown) else 1.0
         memory = int(np.clip(np.ceil(2 / max(usual, 1e-3 / self.per_frame)), 3, 200 * self.per_frame))
-        edge: Bools = np.concatenate([[True], self._edges(), [True]])
+        # In a direction that few spots hardly determine the motion is that of a gap.
+        edge: Bools = np.concatenate([[True], self._edges() | weak_frames(info.information, self.measured), [True]])
         near: Bools = largest_near(edge, memory)[1:-1]
         return ~near
 
