@@ -211,14 +211,15 @@ def hidden_by_symmetry(run: Run, statistics: RunStatistics, sampler: FrameSample
     if statistics.first_pose is None or (run.folder / "truth" / "pose.csv").exists():
         return ()
     prior, parameters = PosePrior.everywhere(run.rig) if run.prior is None else run.prior, run.tracker.labels
-    every = invisible_mistakes(run.rig, prior, parameters, statistics.first_pose)
-    hidden = {one.mistake.what: one for one in every if not one.is_harmless}
     if run.covariance is not None and (recording := sampler.recording()) is not None:
         from lab.runs.model_check.symmetry import Recorded  # with the refinement: only with a covariance
 
-        given = Recorded.of(run.rig, run.covariance, run.prior, parameters, recording)
-        hidden |= {one.mistake.what: one for one, _ in given.hidden(least=LEAST_SHOWN)}
-    return tuple(not_shown(one, "the recording") for one in hidden.values())
+        given = Recorded.of(run.rig, run.covariance, prior, parameters, recording)
+        hidden = [one for one, _ in given.hidden(least=LEAST_SHOWN)]
+    else:
+        every = invisible_mistakes(run.rig, prior, parameters, statistics.first_pose)
+        hidden = [one for one in every if not one.is_harmless]
+    return tuple(not_shown(one, "the recording") for one in hidden)
 
 
 def not_shown(one: Invisible, recording: str) -> Finding:

@@ -338,11 +338,17 @@ class Invisible:
     off_m: float
     off_deg: float
     chi2: float  # of the poses' difference, with the covariances of both
+    rms_px: float  # to which these other poses fit simulated points, which are exact
 
     @property
     def is_harmless(self) -> bool:
         """Whether the poses are the same to their sigmas, as where only names are exchanged."""
         return self.chi2 < chi2_limit(P_SAME, 6)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the rig as stated hides it, and not only one within its stated sigmas."""
+        return self.rms_px < LARGEST_RMS_PX
 
 
 def invisible_mistakes(
@@ -398,7 +404,7 @@ def invisible_mistakes(
                 near = PosePrior(fit.world_from_body, NEAR_M, NEAR_RAD)
         if len(off) == TRIED:
             worst = np.max(off, axis=0)
-            yield Invisible(mistake, float(worst[0]), float(np.rad2deg(worst[1])), float(worst[2]))
+            yield Invisible(mistake, float(worst[0]), float(np.rad2deg(worst[1])), *worst[2:].tolist())
 
 
 def _recorded(mistake: Mistake, model: SpotModel, pixels: Array) -> Array:
@@ -433,7 +439,7 @@ def _explains_all(one: Labelling, points: dict[str, Detections], to_sigmas: bool
 
 
 def _off(fit: PoseFit, pose: Pose, covariance: Array) -> Array:
-    """Distance, m, and angle, rad, of a fitted pose from another one, and the chi-square of their difference (3,)."""
+    """Distance, m, and angle, rad, of a fitted pose from another one, their chi-square, and the RMS of the fit (4,)."""
     off = fit.world_from_body.minus(pose)
     chi2 = off @ np.linalg.solve(fit.covariance + covariance, off)
-    return np.array([np.linalg.norm(off[:3]), np.linalg.norm(off[3:]), chi2])
+    return np.array([np.linalg.norm(off[:3]), np.linalg.norm(off[3:]), chi2, fit.rms_px])

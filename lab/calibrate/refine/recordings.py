@@ -25,7 +25,6 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.visibility import assumed_range, poses_within
 from geometry.rig import Rig
-from geometry.rotations import matrix_from_quaternion
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import (
     CLOCK,
@@ -275,29 +274,29 @@ def hidden_mistakes(
     """Findings on mistakes that a run does not show; a pose in its truth decides."""
     out: dict[str, Finding] = {}
     for labelled in runs:
-        run = labelled.run
-        truth = load_run_truth(run)
-        poses = None if truth is None or truth.pose is None or not len(truth.pose.t_s) else truth.pose
-        at_s = None if poses is None else _time_in_both(poses.t_s, labelled.recording)
+        run, known = labelled.run, _known_pose(labelled)
+        at_s = None if known is None else known[0]
         given = Recorded.of(rig, prior, run.prior, run.tracker.labels, labelled.in_views_of(rig), at_s)
         for one, other in given.hidden(stacks):
-            if poses is None or at_s is None:
+            if known is None:
                 out.setdefault(one.mistake.what, not_shown(one, run.name))
-                continue
-            i = int(np.argmin(np.abs(poses.t_s - at_s)))
-            true = Pose(matrix_from_quaternion(poses.quaternion_wxyz[i]), poses.position_m[i])
-            near = (r.poses[int(np.argmin(np.abs(r.t_s - at_s)))] for r in (other, given.recording))
-            off = [np.linalg.norm(true.minus(pose)) for pose in near]
-            if off[0] < off[1]:
-                what = f"{run.name}: {one.mistake.what}: only without this the poses agree with truth/pose.csv"
-                out[one.mistake.what] = finding("BP-M06", Level.FAIL, what, remedy=sentence(one.mistake.remedy))
+            elif other is not None:
+                near = (r.poses[int(np.argmin(np.abs(r.t_s - known[0])))] for r in (other, given.recording))
+                off = [np.linalg.norm(known[1].minus(pose)) for pose in near]
+                if off[0] < off[1]:
+                    what = f"{run.name}: {one.mistake.what}: only without this the poses agree with truth/pose.csv"
+                    out[one.mistake.what] = finding("BP-M06", Level.FAIL, what, remedy=sentence(one.mistake.remedy))
     return tuple(sorted(out.values(), key=lambda f: -f.level)[:MOST_NAMED])
 
 
-def _time_in_both(t_s: Array, recording: ModelCheckRecording) -> float:
-    """The time of a known pose that is nearest to one of a frame with a pose."""
-    ours = recording.t_s[finite(recording.poses.translation, -1)]
-    return float(t_s[np.argmin(np.abs(t_s - ours[:, None]).min(axis=0, initial=np.inf))])
+def _known_pose(labelled: LabelledRun) -> tuple[float, Pose] | None:
+    """The time and pose in the truth of a run that are nearest to a frame with a pose; None without truth."""
+    truth, recording = load_run_truth(labelled.run), labelled.recording
+    if truth is None or truth.pose is None or not len(truth.pose.t_s):
+        return None
+    ours, known = recording.t_s[finite(recording.poses.translation, -1)], truth.pose
+    i = int(np.argmin(np.abs(known.t_s - ours[:, None]).min(axis=0, initial=np.inf)))
+    return float(known.t_s[i]), Pose.from_quaternion(known.quaternion_wxyz[i], known.position_m[i])
 
 
 # What is known of a rig before a refinement: the covariance of its file, and sigmas given for some of its parts.

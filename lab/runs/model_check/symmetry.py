@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,59 +61,62 @@ class Recorded:
 
     def hidden(
         self, stacks: Collection[str] = STACKS, least: int = 0
-    ) -> Iterator[tuple[Invisible, ModelCheckRecording]]:
+    ) -> Iterator[tuple[Invisible, ModelCheckRecording | None]]:
         """Mistakes without which another rig and another first pose fit as well, and the recording without them.
 
-        stacks: of the rig's numbers, those that are not as they are stated. least: of directions of these that
-        change the recording.
+        stacks: of the rig's numbers, those that are not as they are stated. least: of directions of these that must
+        change the recording if the rig as stated is not symmetric.
         """
         if not len(self.recording.seen):
             return
         given = None
         for one in invisible_mistakes(self.rig, self.prior, self.parameters, self.recording.poses[0], self.covariance):
-            other = None if one.is_harmless else self._without(one.mistake)
-            if other is None:
+            if one.is_harmless:
                 continue
-            given = given or _fit(self.rig, self.covariance, self.recording, stacks)
-            if given is None or len(given.data[0].y) < least:
-                return
-            if _as_good(_fit(one.mistake.rig, self.covariance, other, stacks), given, other):
-                yield one, other
+            other = self._without(one.mistake)
+            if not one.is_exact:
+                if other is None:
+                    continue
+                given = given or _fit(self.rig, self.covariance, self.recording, stacks)
+                if given is None or len(given.data[0].y) < least:
+                    return
+                if not _as_good(_fit(one.mistake.rig, self.covariance, other, stacks), given, other):
+                    continue
+            yield one, other
 
     def _without(self, mistake: Mistake) -> ModelCheckRecording | None:
         """The frames that fit without a mistake, with other labels and poses; None where many do not."""
-        model, labelled = SpotModel.of(mistake.rig), SpotModel.of(self.rig)
+        model, recorded, recording = SpotModel.of(mistake.rig), SpotModel.of(self.rig), self.recording
         calibration, near = RigUncertainty(mistake.rig, model, self.covariance), self.prior
-        recording = self.recording
-        used = recording.usable
+        changes = [mistake.pictures.get(camera, PictureChange(camera)) for camera, _ in model.views]
         poses: list[Pose] = []
         rows: list[int] = []
-        source = np.full((len(used), len(model)), NO_POINT)  # the view as whose spot a spot has been labelled
-        for k in range(len(used)):
-            views = {
-                name: np.flatnonzero(used[k] & (labelled.camera_of == c)) for c, name in enumerate(self.rig.cameras)
-            }
-            found = {
-                name: Detections.at(recording.uv_px[k, of], recording.cov_px2[k, of]) for name, of in views.items()
-            }
+        source = np.full((len(recording.seen), len(model)), NO_POINT)  # the view as whose spot a spot has been labelled
+        for k, used in enumerate(recording.usable):
+            views = {name: np.flatnonzero(used & (recorded.camera_of == c)) for c, name in enumerate(self.rig.cameras)}
+            found = {n: Detections.at(recording.uv_px[k, of], recording.cov_px2[k, of]) for n, of in views.items()}
             if rows:
                 step = recording.poses[k].minus(recording.poses[rows[-1]])
                 size, turn = (_FARTHER[0] * float(np.linalg.norm(part)) + _FARTHER[1] for part in (step[:3], step[3:]))
                 near = PosePrior(poses[-1], size, turn)
             points = mistake.points([{}, found, {}])
             best = candidate_labellings(mistake.rig, model, points, near, self.parameters, calibration, most=1)
-            if not best or np.count_nonzero(best[0].point_of != NO_POINT) < np.count_nonzero(used[k]):
+            if not best or np.count_nonzero(best[0].point_of != NO_POINT) < np.count_nonzero(used):
                 if not rows:
                     return None
                 continue
             rows.append(k)
             poses.append(best[0].fit.world_from_body)
             for v in np.flatnonzero(best[0].point_of != NO_POINT):
-                source[k, v] = views[_source(mistake, model.views[v][0])][best[0].point_of[v]]
-        same = (source[rows] == np.arange(len(model))) | (source[rows] == NO_POINT)
-        if len(rows) < _FITTING * len(used) or (same.all() and not mistake.pictures):
+                source[k, v] = views[changes[v].source][best[0].point_of[v]]
+        as_recorded = np.array([camera not in mistake.pictures for camera, _ in model.views])
+        same = (as_recorded & (source[rows] == np.arange(len(model)))) | (source[rows] == NO_POINT)
+        if len(rows) < _FITTING * len(recording.seen) or same.all():
             return None  # the stated sigmas of the same spots are what a refinement tests
-        return _relabelled(mistake, model, recording.at(np.array(rows)), source[rows], Pose.stack(poses))
+        clocks = recording.clock_s
+        if clocks is not None:
+            clocks = clocks[[recorded.camera_of.tolist().index(recorded.camera_names.index(c.source)) for c in changes]]
+        return _relabelled(recording.at(np.array(rows)), source[rows], changes, Pose.stack(poses), clocks)
 
 
 def _fit(
@@ -140,28 +143,17 @@ def _misfit(one: Refinement, given: Refinement) -> float:
     return float(white @ white) + wider / usual * sum(d.rest for d in one.data)
 
 
-def _source(mistake: Mistake, camera: str) -> str:
-    """The camera under whose name the pictures of a camera are recorded."""
-    return mistake.pictures[camera].source if camera in mistake.pictures else camera
-
-
 def _relabelled(
-    mistake: Mistake, model: SpotModel, recording: ModelCheckRecording, source: Ints, poses: Pose
+    old: ModelCheckRecording, source: Ints, changes: Sequence[PictureChange], poses: Pose, clock_s: Array | None
 ) -> ModelCheckRecording:
-    """The spots `source` (T, n) of a recording, with -1 for none, as those of n other views."""
-    changes = [mistake.pictures.get(camera, PictureChange(camera)) for camera, _ in model.views]
+    """The spots `source` (T, n) of a recording, with -1 for none, as those of n other views with changed pictures."""
     turn, shift = (np.stack([getattr(c, name) for c in changes]) for name in ("turn", "shift"))
-    seen, rows = source != NO_POINT, np.arange(len(source))[:, None]
+    seen, rows, velocity = source != NO_POINT, np.arange(len(source))[:, None], old.velocity_px_s
 
     def turned(values: Array) -> Array:
         return np.where(seen[..., None], np.einsum("nij,knj->kni", turn, values[rows, source]), np.nan)
 
-    velocity, clocks = recording.velocity_px_s, recording.clock_s
-    cameras = list(mistake.rig.cameras)
-    views = [next(v for v, (camera, _) in enumerate(model.views) if camera == _source(mistake, c)) for c in cameras]
     return ModelCheckRecording(
-        recording.t_s, seen, turned(recording.uv_px) + shift,
-        turn @ recording.cov_px2[rows, source] @ np.swapaxes(turn, -1, -2), poses,
-        velocity_px_s=None if velocity is None else np.nan_to_num(turned(velocity)),
-        clock_s=None if clocks is None else clocks[np.array(views)[model.camera_of]],
+        old.t_s, seen, turned(old.uv_px) + shift, turn @ old.cov_px2[rows, source] @ np.swapaxes(turn, -1, -2), poses,
+        velocity_px_s=None if velocity is None else np.nan_to_num(turned(velocity)), clock_s=clock_s,
     )  # fmt: skip

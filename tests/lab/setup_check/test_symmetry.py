@@ -70,6 +70,14 @@ def test_a_rest_shows_too_little_of_a_rig_for_a_statement():
     assert not list(replace(given, recording=still).hidden(least=10))
 
 
+def test_a_camera_without_labels_says_nothing_about_its_pictures():
+    lab, scenes, _ = bench.campaign(78422, 60, 1)
+    recording, model = bench.with_true_labels(scenes[0]), SpotModel.of(lab.rig)
+    without = replace(recording, seen=recording.seen & (model.camera_of != model.camera_names.index("third")))
+    covariance = bench.rig_covariance(lab.rig, bench.Sigmas(clocks=0.0))
+    assert not list(Recorded.of(lab.rig, covariance, scenes[0].prior, LabelParameters(), without).hidden())
+
+
 def exchanged(folder: Path, *, truth: bool) -> Path:
     """A recording whose rig.yaml is off by its sigmas, and has the cameras in each other's place."""
     run = simulate("unequal-fan", folder / "run", seed=3, frames=60, detections_only=True, clutter=0.0)
