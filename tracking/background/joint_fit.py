@@ -325,12 +325,12 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     places = covariance[5 : 5 + 2 * n, 5 : 5 + 2 * n].reshape(n, 2, n, 2)
     slopes = seen.place_slopes(light)
     of_places = np.einsum("ikm,jkm->kij", slopes, slopes)
-    with np.errstate(over="ignore"):  # a light that has left the pixels
+    with np.errstate(over="ignore", invalid="ignore"):  # a light that has left the pixels
         alone = np.linalg.pinv(of_places, hermitian=True)  # if the background were known
     every, own = (float(np.trace(P, axis1=1, axis2=2).mean()) / 2 for P in (np.einsum("kikj->kij", places), alone))
     mean = float(np.trace(places.mean(axis=(0, 2)))) / 2 * max(chi2, 1.0)
     height = (light.plain + light.modulated * seen.behind)[seen.light_of.max(axis=0) > 0.1]
-    bad = chi2 > _LARGEST_CHI2 or not height.size or float(np.median(height)) <= 0
+    bad = chi2 > _LARGEST_CHI2 or not np.isfinite(own) or not height.size or float(np.median(height)) <= 0
     modulated = light.modulated * pixels.usual
     # Its share of the light must lie within 1 of the usual one.
     bad |= abs(modulated - MODULATED[0] * (light.plain + modulated)) > light.plain + modulated
