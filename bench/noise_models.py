@@ -8,7 +8,6 @@ scale. The truth is measured on exposures of flat fields, including saturation, 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 import traceback
 from collections import Counter
@@ -24,7 +23,7 @@ from bench.random_pictures.looks import FAMILIES
 from bench.random_pictures.render import Renderer
 from bench.random_pictures.report import within
 from bench.random_pictures.scene import picture_scene
-from bench.random_scenes.processes import results_of
+from bench.random_scenes.processes import shown_results
 
 AT_BACKGROUND, AT_HALF = 1.3, 2.0  # the goals: within these factors
 WORST = 15
@@ -143,14 +142,7 @@ def main() -> None:
     a = parser.parse_args()
     names = [None] if a.family is None else list(FAMILIES) if a.family == "all" else [a.family]
     jobs = [Job(a.first + i, names[i % len(names)]) for i in range(a.scenes)]
-    rows = []
-    for row in results_of(measured, jobs, a.jobs):
-        rows.append(row)
-        if a.verbose:
-            print(line(row), flush=True)
-        elif sys.stderr.isatty():
-            print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
-    print(summary(rows))
+    print(summary(shown_results(measured, jobs, a.jobs, line if a.verbose else None)))
 
 
 if __name__ == "__main__":

@@ -35,7 +35,8 @@ def test_other_processes_call_no_function_of_a_main_module_which_they_do_not_imp
     handed_over = {
         name.id
         for call in called
-        if getattr(call.func, "id", getattr(call.func, "attr", "")) in ("results_of", "imap", "Process")
+        if getattr(call.func, "id", getattr(call.func, "attr", ""))
+        in ("results_of", "shown_results", "imap", "Process")
         for name in call.args
         if isinstance(name, ast.Name)
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 import traceback
@@ -18,7 +17,7 @@ from bench.random_pictures.report import crashed, details, summary, write_rows
 from bench.random_pictures.scene import picture_scene
 from bench.random_pictures.surroundings import photographs
 from bench.random_pictures.write_folder import write_pictures
-from bench.random_scenes.processes import results_of
+from bench.random_scenes.processes import shown_results
 from lab.errors import BeamposeError
 from lab.runs.process import process_run
 
@@ -65,13 +64,7 @@ def picture_jobs(
 
 def run_pictures(jobs: list[PictureJob], workers: int, out: Path | None, verbose: bool) -> None:
     """Run the scenes and print the summary; out: a CSV file with a row per scene."""
-    rows: list[PictureJudgement] = []
-    for row in results_of(judged, jobs, workers):
-        rows.append(row)
-        if verbose:
-            print(details(row), flush=True)
-        elif sys.stderr.isatty():
-            print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
+    rows = shown_results(judged, jobs, workers, details if verbose else None)
     if out is not None:
         write_rows(rows, out)
     print(summary(rows))

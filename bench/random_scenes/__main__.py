@@ -9,15 +9,13 @@ NAME`: see variants.py.
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from bench.random_pictures.command import picture_jobs, run_pictures
 from bench.random_pictures.looks import FAMILIES as PICTURE_FAMILIES
 from bench.random_scenes.command import Job, judged
 from bench.random_scenes.families import FAMILIES
-from bench.random_scenes.judge import Judgement
-from bench.random_scenes.processes import results_of
+from bench.random_scenes.processes import shown_results
 from bench.random_scenes.report import details, summary, write_rows
 from bench.random_scenes.variants import CHANGES
 
@@ -53,13 +51,7 @@ def main() -> None:
         run_pictures(picture, a.jobs, a.out, a.verbose)
         return
     jobs = [Job(s, a.frames, a.family, a.through_files, a.keep, a.variant) for s in a.seeds]
-    rows: list[Judgement] = []
-    for row in results_of(judged, jobs, a.jobs):
-        rows.append(row)
-        if a.verbose:
-            print(details(row), flush=True)
-        elif sys.stderr.isatty():
-            print(f"\r{len(rows)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
+    rows = shown_results(judged, jobs, a.jobs, details if a.verbose else None)
     if a.out is not None:
         write_rows(rows, a.out)
     if a.family is not None:
