@@ -164,15 +164,16 @@ def _modulation(fits: Sequence[JointFit], seen: Exposures) -> Modulation | None:
 
     That is known beforehand to be usual. Lights on even ground do not show the modulation, on unlit ground hardly.
     """
-    share, variance = np.array([fit.shown for fit in fits]).reshape(-1, 2, 1).transpose(1, 0, 2)
-    ratio = np.array([fit.level_dn / seen.usual_dn for fit in fits]).reshape(-1, 1)
-    expected, slope = share_at(_SHARES, ratio)
-    spread2 = variance + (UNLIKE * slope) ** 2
-    cost = np.sum(0.5 * np.log(spread2) + 2 * np.log1p((share - expected) ** 2 / spread2 / 3), axis=0)  # Student's, 3
+    share, variance, level = np.array([(*fit.shown, fit.level_dn) for fit in fits]).reshape(-1, 3).T
+    ratio = level / seen.usual_dn
+    expected, slope = share_at(_SHARES, ratio[:, None])
+    spread2 = variance[:, None] + (UNLIKE * slope) ** 2
+    off2 = (share[:, None] - expected) ** 2 / spread2
+    cost = np.sum(0.5 * np.log(spread2) + 2 * np.log1p(off2 / 3), axis=0)  # Student's, 3 degrees of freedom
     middle = float(_SHARES[np.argmin(cost)])
     likely = np.exp(np.min(cost) - cost)
     expected, slope = share_at(np.array(middle), ratio)
-    off, variance = ((share - expected) / slope)[:, 0], (variance / slope**2)[:, 0]  # of shares on usual ground
+    off, variance = (share - expected) / slope, variance / slope**2  # of shares on usual ground
     weight = 1 / (variance + UNLIKE**2)
     if float(np.sum(weight)) < 1 / (UNLIKE**2 + _LARGEST_SIGMA**2):
         return None

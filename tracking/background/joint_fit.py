@@ -39,9 +39,9 @@ _LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # sigmas of the noise
 _ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
 _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
+_LEAST_SHOWN = 1e-3  # share of the information on the modulation
 # Widths: error of the places that the model leaves. With it the products of the errors in successive pictures agree
 # with the stated shared variance (63 lights in front of photographs).
-_LEAST_SHOWN = 1e-3  # share of the information on the modulation
 _LEAST_SIGMA = 0.002
 _LARGEST_CHANGE = 3.0  # of the width, as a factor, from the start
 
