@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tests.cases import further_slow
 from tests.tracking.rendering import Scene, Spot, expected
 from tracking.detection.detect import SpotFinder, _Task, find_spots
 from tracking.detection.regions import EVERYWHERE
@@ -131,7 +132,7 @@ def test_a_wide_spot_in_a_corner_between_bright_surfaces_is_found():
         assert is_found_before_bright_surfaces(4.4, [(first, away), (first + np.pi / 2, 1.2 * away)], seed)
 
 
-@pytest.mark.parametrize("core_px", [3.5, 5.0])
+@pytest.mark.parametrize("core_px", further_slow([3.5, 5.0]))
 def test_a_light_on_a_small_bright_disc_is_found_at_its_own_place(core_px):
     """A fit that grows over the disc's edge describes the disc: it is as wide as that, and its centre lies far away."""
     v, u = np.mgrid[: SIZE[1], : SIZE[0]] * 1.0
