@@ -14,7 +14,7 @@ from geometry import rotations
 from geometry.arrays import Array
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose
-from tests.cases import further_slow
+from tests.marks import further_slow
 
 px = 1.0
 SIZE = (640, 480)

@@ -19,7 +19,7 @@ from lab.calibrate.camera.photos import PhotoSet, as_8_bit, find_in_photos, load
 from lab.errors import InputError
 from lab.pictures import source
 from lab.simulate.board_photo import PhotoSettings, photograph
-from tests.cases import further_slow
+from tests.marks import further_slow
 
 BOARD = parse("chessboard:9x6:25mm")
 

@@ -32,8 +32,8 @@ from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
 from lab.runs.verdict.score import normalised_squares
 from lab.simulate.scenarios import SCENARIOS, RecordingFault
 from lab.simulate.write import simulate
-from tests.cases import further_slow
 from tests.lab.run_folders import write_run
+from tests.marks import further_slow
 from tests.paths import ROOT
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.rigid_body.rigid_tracker import RigidTracker

@@ -36,8 +36,8 @@ from lab.runs.process import process_run
 from lab.runs.setup_check import SampledFrames, frames_of
 from lab.simulate.scenarios import fan, unequal_fan
 from lab.simulate.write import simulate
-from tests.cases import further_slow
 from tests.lab.run_folders import edit, write_run
+from tests.marks import further_slow
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 from tracking.setup_mistakes import evidence

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from geometry.arrays import Array
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tests.tracking.rendering import round_lights
 from tracking.background.behind_lights import BehindLights, Exposures, _lights_of
 from tracking.background.estimation import PICTURES, static_background

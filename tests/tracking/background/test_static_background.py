@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tests.tracking.rendering import round_lights
 from tracking.background import estimation, mean_pictures
 from tracking.background.estimation import PICTURES, EqualLight, static_background

@@ -20,7 +20,7 @@ from studies.fu2016 import (
     projected,
     render,
 )
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tracking.binocular.acquisition import observations
 from tracking.binocular.histories import _has_its_lights, _relative_motion
 from tracking.binocular.joint_fit import MarkerObservations

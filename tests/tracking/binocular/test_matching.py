@@ -10,7 +10,7 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_camera
 from studies.zhou2020 import random_pose
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, images, pose_at
 from tracking.binocular.acquisition import matching_pairs, mirrored
 from tracking.binocular.calibration_check import FittedFrame, clock_offset

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tests.tracking.rendering import Scene, Spot, expected
 from tracking.detection.detect import SpotFinder, _Task, find_spots
 from tracking.detection.regions import EVERYWHERE

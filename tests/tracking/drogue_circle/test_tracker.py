@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tests.tracking.drogue_circle.discs import BLUR_PX, BRIGHT, GREY, covered, discs, rounded
 from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, Window, classical_detector
 from tracking.drogue_circle.printed import PrintedTracker

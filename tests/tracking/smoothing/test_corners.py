@@ -12,7 +12,7 @@ from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.simulate.points import PointRun
 from lab.simulate.scenarios import RIGS, PriorRegion
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tests.tracking.rigid_runs import (
     RIGID,
     Assessment,

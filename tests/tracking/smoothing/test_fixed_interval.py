@@ -9,7 +9,7 @@ import pytest
 
 from geometry.arrays import Array
 from geometry.pose import Pose
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tracking.rigid_body.models.motion import ANY_MOMENT, STATE, predicted, updated
 from tracking.smoothing.motion import fixed_interval
 from tracking.smoothing.motion.fixed_interval import (

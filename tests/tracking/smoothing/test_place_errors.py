@@ -10,7 +10,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import PINHOLE, RigCovariance, perturbed_rig, rig_names, split_name
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
 from lab.simulate.scenarios import RIGS, PriorRegion
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tests.tracking.rigid_runs import assess, recording_of, smoothed_frames, tracked, zig_zag
 from tracking.detections import Detections
 from tracking.smoothing.place_errors import correlation, more_of_means, place_errors

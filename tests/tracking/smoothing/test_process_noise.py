@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tests.tracking.smoothing.test_fixed_interval import Run, drawn
 from tracking.smoothing.motion.fixed_interval import smoothed
 from tracking.smoothing.motion.process_noise import LOG_RANGE, next_log_density

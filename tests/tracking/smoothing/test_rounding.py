@@ -7,7 +7,7 @@ import pytest
 
 from geometry.arrays import Array
 from geometry.compiled_linalg import cholesky, posterior
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tracking.rigid_body.models.motion import STATE
 from tracking.smoothing.motion.fixed_interval import RunInformation, filtered, log_likelihood, smoothed
 from tracking.smoothing.motion.run_detections import Reference, unknown_moments

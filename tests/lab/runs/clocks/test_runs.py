@@ -18,7 +18,7 @@ from geometry.pose import Pose
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tracking.smoothing.motion.clocks import DETERMINED
 from tracking.smoothing.smoother import _Smoother
 

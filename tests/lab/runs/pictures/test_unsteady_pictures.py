@@ -24,7 +24,7 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.files.rig.rig_file import load_rig
 from lab.pictures.delivery import without_repeats
-from tests.cases import further_slow
+from tests.marks import further_slow
 from tests.tracking.rendering import round_lights
 from tracking.background.camera_motion import CameraMotion, shift_between
 from tracking.noise import NoiseModel

@@ -17,7 +17,7 @@ from geometry.camera import Camera
 from geometry.planes import intersect_plane
 from geometry.rig import Screen
 from lab.files.rig.rig_file import load_rig
-from tests.cases import further_slow
+from tests.marks import further_slow
 
 SIZE, FRAMES, WIDE_PX = (512, 640), 30, 38.0
 Y, X = np.mgrid[: SIZE[0], : SIZE[1]]
