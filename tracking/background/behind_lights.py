@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geometry.arrays import Array, Bools, Ints
 from tracking.background.joint_fit import MODULATED, UNLIKE, JointFit, Modulation, fitted, mean_of, share_at
-from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, SAME_LIGHT, inside, near_each, nearest
+from tracking.background.places import AROUND_LIGHT, AROUND_SPOT, ON_LIGHT, inside, near_each, nearest
 from tracking.detections import Detections
 from tracking.noise import NoiseModel
 
@@ -117,13 +117,13 @@ def passing_lights(
     ground = background - np.float32(seen.black_dn)
     every = [(_shown_by(ground, count, d[i : i + 1], seen), k, i) for k, d in enumerate(found) for i in range(len(d))]
     fits: list[JointFit] = []
-    used = Detections.none()  # two lights in one place have the same errors
+    used = Detections.none()  # lights on the same ground have the same errors of it
     for _, k, i in sorted((x for x in every if x[0] > 1 / UNLIKE), reverse=True):
         light = found[k][i : i + 1]
         if len(used) == _MOST_PASSING:
             break
         others = np.arange(len(found[k])) != i
-        if near_each(light, used, SAME_LIGHT).any() or near_each(light, found[k][others], AROUND_LIGHT).any():
+        if near_each(light, used, ON_LIGHT).any() or near_each(light, found[k][others], AROUND_LIGHT).any():
             continue
         used = used.joined(light, _MOST_PASSING)
         width = float(np.sqrt(light.major_px[0] * light.minor_px[0]))

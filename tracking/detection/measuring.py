@@ -108,11 +108,7 @@ def measure(
     if _start_again(image, peaks, chosen, table, limits, restarted):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, False, cells, algebra)
         _drop_background(table, restarted)
-        for k in np.flatnonzero(restarted):
-            if before[k]["flux"] > 0.0 and not (
-                table[k]["flux"] > 0.0 and table[k]["explained"] > before[k]["explained"]
-            ):
-                table[k] = before[k]
+        _keep_better(table, before, restarted)
     if _hold_unresolved(peaks, chosen, table, limits):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, False, cells, algebra)
         _judge_unresolved(image, table, noise, limits)
@@ -231,6 +227,15 @@ def _drop_background(table: Candidates, restarted: Bools) -> None:
         wide = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1] > _OUTGROWN * spot["moment_uu"]
         if wide or height * _STEEPEST < rise:
             spot["flux"] = 0.0
+
+
+@compiled
+def _keep_better(table: Candidates, before: Candidates, restarted: Bools) -> None:
+    """Of restarted fits (n,) that explain no more than those before, or have failed, keep those before."""
+    for k in range(table.shape[0]):
+        better = table[k]["flux"] > 0.0 and table[k]["explained"] > before[k]["explained"]
+        if restarted[k] and before[k]["flux"] > 0.0 and not better:
+            table[k] = before[k]
 
 
 @compiled
