@@ -58,6 +58,7 @@ class RimPoints:
     spacing_px: float  # between neighbouring rays at the rim
     blur_px: float = 0.0  # sigma of the blurred edge
     common_px: float = 0.0  # shift of all edges by a slope inside the target, whose size is not known; 0: none
+    noise_px: float = 0.0  # error of the usual edge by the noise of the picture
     beside_gap: Bools | None = None  # (n,) edges that fit, but are left out since an occluder may end next to them
 
     @property
@@ -143,11 +144,14 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
         radius -= sigma**2 * away / height
         common = abs(sigma**2 * inner / upper_median(height[good]))
         common = common if common > _LEAST_COMMON_PX else 0.0
+    # The second derivative of filtered white noise over the third one of the edge at its steepest place.
+    noise = np.sqrt(0.75) * crop.noise_dn / crop.blur_px**2 * sigma**2
+    noise = noise / upper_median(strength[good]) if good.any() else 0.0
     if hidden is None:
-        return RimPoints(rim, theta, radius, strength, radius, spacing, sigma, common)
+        return RimPoints(rim, theta, radius, strength, radius, spacing, sigma, common, noise)
     own = ~hidden[(rows * len(hidden)) // n]
     seen = np.where(own, radius, np.nan)
-    return RimPoints(rim, theta, seen, np.where(own, strength, np.nan), radius, spacing, sigma, common)
+    return RimPoints(rim, theta, seen, np.where(own, strength, np.nan), radius, spacing, sigma, common, noise)
 
 
 def _beside(
@@ -230,6 +234,8 @@ class RimFit:
     polarity: int
     score: float  # coverage, reduced by residuals
     sectors: Array  # (SECTORS,) share of the rays of a sector whose edge lies on the rim, hidden ones too
+    # Share of the covariance that is not the picture's noise: texture and background move rims of the next ones alike.
+    lasting: float = 0.0
 
     @property
     def centre_and_radius(self) -> Array:
@@ -432,7 +438,9 @@ def _described(
     weighted = A * weight[good, None]
     x = np.linalg.solve(weighted.T @ A + prior, weighted.T @ away[good])
     away[good] -= A @ x
-    covariance = _error_power(np.where(good, away, 0.0), good, points.spacing_px) * np.linalg.inv(A.T @ A + prior)
+    power = _error_power(np.where(good, away, 0.0), good, points.spacing_px)
+    covariance = np.asarray(power * np.linalg.inv(A.T @ A + prior), float)
+    lasting = max(1 - points.noise_px**2 * max(CORRELATED_PX / points.spacing_px, 1.0) / power, 0.0)
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
     covariance[2, 2] += (_BLUR_SIGMA * points.blur_px**2 / (2 * max(rim.radius_px, 1.0))) ** 2 + points.common_px**2
     rms = float(np.sqrt(_sum_of_squares(rim, replace(points, radius_px=points.any_radius_px), fits)))
@@ -441,7 +449,8 @@ def _described(
     sectors = np.bincount(sector, on_rim, SECTORS) / np.maximum(np.bincount(sector, minlength=SECTORS), 1)
     beside = coverage - float(np.mean(good))
     before = np.array(astuple(points.about)[: 5 if oblique else 3])
-    return RimFit(Rim(*(before + x[: len(before)]).tolist()), covariance, coverage, rms, beside, coarse.polarity, coverage / (1 + rms), sectors)
+    best, score = Rim(*(before + x[: len(before)]).tolist()), coverage / (1 + rms)
+    return RimFit(best, covariance, coverage, rms, beside, coarse.polarity, score, sectors, lasting)
 
 
 def _error_power(away: Array, good: Bools, spacing_px: float) -> float:

@@ -35,7 +35,7 @@ _EVERY = 4  # every 4th row and column is enough for the noise
 # A target larger than the background's square has contrast along its edge only. Such an edge is as bright as the blob
 # on its inner side and as the background on its outer one: both on this share of its surroundings.
 _EDGE_SHARE, _AS_BLOB, _AS_BACKGROUND = 0.2, 0.3, 0.7  # the limits are shares of the peak of the contrast
-# Power of slope over peak, the inverse of the width of an edge, in the order of the blobs. The first is the target where
+# Power of slope over peak, the inverse of the width of an edge, in the order of blobs. The first is the target where
 # nothing else is known, and a part of a cloud may have four times its sum of contrasts with edges twice as wide.
 _SHARPNESS = 3
 _RING_PX = 7  # side of the square that reaches the surroundings
