@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from tests.tracking.drogue_circle.discs import BLUR_PX, BRIGHT, GREY, covered, discs, rounded
+from tests.tracking.drogue_circle.discs import BLUR_PX, covered, discs, rounded, textured
 from tracking.drogue_circle.detectors import (
     CircleCandidate,
     CircleParameters,
@@ -160,24 +160,13 @@ def test_the_covariance_is_that_of_the_errors():
     assert errors.median("ours") < 0.2 < min(errors.median("opencv"), errors.median("printed"))
 
 
-def textured(rng, centre, radius, coarse_px, sigma_dn):
-    """A disc whose grey values are a smooth random field, before an even grey."""
-    n = 4
-    v, u = (np.mgrid[: 120 * n, : 160 * n] + 0.5) / n - 0.5
-    field = cv2.GaussianBlur(rng.normal(size=v.shape), (0, 0), n * coarse_px)
-    inside = np.hypot(u - centre[0], v - centre[1]) < radius
-    light = np.where(inside, BRIGHT + sigma_dn * field / field.std(), GREY).astype(np.float32)
-    light = cv2.GaussianBlur(cv2.resize(light, (160, 120), interpolation=cv2.INTER_AREA), (0, 0), 1.0)
-    return rounded(light + rng.normal(0, 1.5, light.shape))
-
-
 def test_the_covariance_of_a_textured_disc_is_that_of_its_errors():
     """Texture moves neighbouring edges alike: over ten pixels of the rim and more, which adds to one side."""
     rng = np.random.default_rng(31)
     nees = []
     for _ in range(100):
         centre, radius = rng.uniform((78, 58), (82, 62)), rng.uniform(20, 45)
-        fit = fitted(textured(rng, centre, radius, rng.uniform(2, 6), 22.0), *centre + 0.4, radius + 0.3, polarity=-1)
+        fit = fitted(textured(rng, centre, radius, rng.uniform(2, 6)), *centre + 0.4, radius + 0.3, polarity=-1)
         assert fit is not None
         away = fit.centre_and_radius[:2] - centre
         nees.append(away @ np.linalg.solve(fit.covariance_px2[:2, :2], away) / 2)
