@@ -147,11 +147,9 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     # The second derivative of filtered white noise over the third one of the edge at its steepest place.
     noise = np.sqrt(0.75) * crop.noise_dn / crop.blur_px**2 * sigma**2
     noise = noise / upper_median(strength[good]) if good.any() else 0.0
-    if hidden is None:
-        return RimPoints(rim, theta, radius, strength, radius, spacing, sigma, common, noise)
-    own = ~hidden[(rows * len(hidden)) // n]
-    seen = np.where(own, radius, np.nan)
-    return RimPoints(rim, theta, seen, np.where(own, strength, np.nan), radius, spacing, sigma, common, noise)
+    own = True if hidden is None else ~hidden[(rows * len(hidden)) // n]
+    seen, slopes = np.where(own, radius, np.nan), np.where(own, strength, np.nan)
+    return RimPoints(rim, theta, seen, slopes, radius, spacing, sigma, common, noise)
 
 
 def _beside(
