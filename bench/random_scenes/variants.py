@@ -99,7 +99,7 @@ def _thinned(scene: Scene, rng: np.random.Generator) -> Scene:
     k = np.arange(0, len(scene), int(rng.integers(2, 5)))
     poses = Pose(scene.poses.rotation[k], scene.poses.translation[k])
     return replace(
-        scene, frame_rate_hz=scene.frame_rate_hz / k[1], poses=poses,
+        scene, frame_rate_hz=scene.frame_rate_hz / int(k[1]), poses=poses,
         uv_px=scene.uv_px[k], in_view=scene.in_view[k], has_image=scene.has_image[k],
         detections=tuple(scene.detections[i] for i in k), origin=tuple(scene.origin[i] for i in k),
         corner_frames=scene.corner_frames / k[1],

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from calibration.screens.clouds import MissingOpen3DError, _explained, open3d
-from tests.open3d_marker import needs_open3d
+from tests.marks import needs_open3d
 from tests.paths import ROOT
 
 

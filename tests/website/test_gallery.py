@@ -31,6 +31,7 @@ def mirrored():
     return replace(sight, commands=("check RUN",), recording={**sight.recording, "frames": 12})
 
 
+@pytest.mark.slow
 def test_a_page_shows_what_the_command_printed_and_the_picture(mirrored, tmp_path):
     page = gallery.make(mirrored, tmp_path / "work", tmp_path / "out")
     shown = re.search(r"```console\n(.*?)```", page, re.DOTALL)[1].splitlines()

@@ -14,6 +14,7 @@ from geometry import rotations
 from geometry.arrays import Array
 from geometry.camera import FISHEYE, PERSPECTIVE, Camera
 from geometry.pose import Pose
+from tests.marks import further_slow
 
 px = 1.0
 SIZE = (640, 480)
@@ -177,7 +178,7 @@ def test_the_light_of_two_blurred_edges_is_that_of_the_bivariate_normal_distribu
         np.testing.assert_allclose(by[0, k], (slope[1] - slope[0])[0] / (2 * h), atol=2e-3)
 
 
-@pytest.mark.parametrize(("lens", "blur_px"), [("pinhole", 2.0), ("fisheye", 0.7)])
+@pytest.mark.parametrize(("lens", "blur_px"), further_slow([("fisheye", 0.7), ("pinhole", 2.0)]))
 def test_the_scatter_of_each_corner_is_its_stated_sigma(lens, blur_px):
     """Of wide and narrow squares, sharp and out of focus, and with five times the noise in half of the picture."""
     board = parse("chessboard:9x6:30mm")

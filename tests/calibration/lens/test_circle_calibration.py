@@ -60,6 +60,7 @@ def centroids_and_areas(ring: Array) -> tuple[Array, Array]:
     return np.sum((ring + following) * parts[..., None], axis=1) / (6 * area[:, None]), np.abs(area)
 
 
+@pytest.mark.slow
 def test_blur_does_not_displace_oblique_circles_under_a_wide_lens_towards_its_middle():
     board, K = SYMMETRIC, np.array([[447.0, 0, 640.0], [0, 447.0, 490.0], [0, 0, 1]])
     camera = Camera("", "", (1280, 960), K, (0.01, 0.003, 0.0, 0.0), Pose.identity(), lens=FISHEYE)

@@ -27,6 +27,7 @@ def with_own_errors(table, seed, most_px):
     return replace(table, pixels=table.pixels + most_px * away)
 
 
+@pytest.mark.slow
 def test_a_model_that_errs_alike_where_corners_were_seen_is_not_chosen_if_it_leaves_the_rest_of_the_picture_open():
     """Boards in the middle: with the rotation that fits there, rich models left 18 px open where four left 5."""
     lens = (800.0, 801.0, 639.5, 511.5, -0.25, 0.08, 3e-4, -2e-4)

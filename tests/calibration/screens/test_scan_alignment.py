@@ -9,7 +9,7 @@ from calibration.screens import clouds
 from calibration.screens.clouds import align, on_surfaces
 from geometry.pose import Pose
 from geometry.rotations import exp
-from tests.open3d_marker import needs_open3d
+from tests.marks import needs_open3d
 
 pytestmark = needs_open3d
 

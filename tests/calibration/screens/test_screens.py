@@ -25,7 +25,7 @@ from geometry.arrays import numeric_jacobian
 from geometry.pose import Pose
 from geometry.rotations import exp, log
 from tests.calibration.screens.networks import lab, measured
-from tests.open3d_marker import needs_open3d
+from tests.marks import needs_open3d
 
 SIGMA = 3e-4
 

@@ -237,6 +237,7 @@ print(value == caller.climbed.py_func(0.5), errors, copied, [n for n in begun if
 """
 
 
+@pytest.mark.slow
 def test_a_large_function_is_called_and_not_copied(program, tmp_path):
     """Compiled, from disk, called by one that is compiled again, and that from disk: with its errors.
 
@@ -266,6 +267,7 @@ def test_a_large_function_is_called_and_not_copied(program, tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_code_for_other_types_than_its_index_says_is_compiled_again(program, tmp_path):
     """Two processes that keep code of one function at once may give their files the same name."""
     copy = tmp_path / "program"
@@ -298,6 +300,7 @@ else:
 """
 
 
+@pytest.mark.slow
 def test_code_of_two_processes_that_name_functions_alike_is_called_together(program, tmp_path):
     """numba numbers functions by process: `hill` has the same name in both here, and `slope`, which it calls, has not.
 
@@ -324,6 +327,7 @@ def test_code_of_two_processes_that_name_functions_alike_is_called_together(prog
     assert others == pytest.approx([2 * hill, 3 * hill, 3 * hill], rel=1e-12)
 
 
+@pytest.mark.slow
 def test_with_a_numba_that_has_other_internals_code_is_kept_and_never_that_of_an_edited_source(program, tmp_path):
     copy = tmp_path / "program"
     shutil.copytree(program, copy, ignore=shutil.ignore_patterns("__pycache__"))

@@ -19,6 +19,7 @@ from lab.calibrate.camera.photos import PhotoSet, as_8_bit, find_in_photos, load
 from lab.errors import InputError
 from lab.pictures import source
 from lab.simulate.board_photo import PhotoSettings, photograph
+from tests.marks import further_slow
 
 BOARD = parse("chessboard:9x6:25mm")
 
@@ -150,7 +151,7 @@ def test_only_the_first_pictures_without_a_board_are_searched_thoroughly(at_once
     assert {reason for _, reason in found.refused} == {found.refused[0][1]}
 
 
-@pytest.mark.parametrize("at_once", [1, pytest.param(2, marks=pytest.mark.slow), 4])
+@pytest.mark.parametrize("at_once", further_slow([4, 1, 2]))
 def test_a_video_that_shows_a_charuco_board_now_and_then_has_the_reasons_of_three_frames_only(
     at_once, tmp_path, monkeypatch
 ):

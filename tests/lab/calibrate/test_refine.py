@@ -193,6 +193,7 @@ def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays
     assert not (tmp_path / "new-failed" / "rig.yaml").exists()
 
 
+@pytest.mark.slow
 def test_a_camera_without_a_spot_where_it_may_be_is_named_after_one_search_for_mistakes(
     lab, short, tmp_path, monkeypatch
 ):
@@ -206,6 +207,7 @@ def test_a_camera_without_a_spot_where_it_may_be_is_named_after_one_search_for_m
     assert len(searches) == 1
 
 
+@pytest.mark.slow
 def test_a_camera_whose_points_may_be_its_spots_is_left_out_and_the_recording_used(tmp_path):
     seed, sigmas = 821, bench.Sigmas()  # the camera `third` sees one spot, whose place is uncertain by 100 px
     drawn, scenes, _ = bench.campaign(seed, 75, clocks_s=sigmas.clocks)
@@ -417,6 +419,7 @@ def moved_camera(tmp_path_factory) -> tuple[Path, Path]:
     return run, folder / "rig.yaml"
 
 
+@pytest.mark.slow
 def test_the_order_in_which_sigmas_are_given_changes_nothing(moved_camera, tmp_path):
     run, rig = moved_camera
     sigmas = ["cameras.row_time_s=2e-6", "cameras.position_m=0.005", "cameras.rotation_deg=0.15"]
@@ -431,6 +434,7 @@ def test_the_order_in_which_sigmas_are_given_changes_nothing(moved_camera, tmp_p
     assert written[0] == pytest.approx(written[1], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_what_is_held_is_named_where_it_explains_the_residuals_that_the_freed_numbers_leave(moved_camera, tmp_path):
     """A camera is off and only row times may change: nobody should keep the given rig."""
     run, rig = moved_camera

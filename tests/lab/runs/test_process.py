@@ -33,6 +33,7 @@ from lab.runs.verdict.score import normalised_squares
 from lab.simulate.scenarios import SCENARIOS, RecordingFault
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
+from tests.marks import further_slow
 from tests.paths import ROOT
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.rigid_body.rigid_tracker import RigidTracker
@@ -343,7 +344,7 @@ def test_a_camera_that_stops_or_starts_late_is_reported(tmp_path):
 
 
 @pytest.mark.parametrize("shift", [0, 1, 3])
-@pytest.mark.parametrize("camera", ["left", "right"])
+@pytest.mark.parametrize("camera", further_slow(["right", "left"]))
 def test_points_whose_frames_are_numbered_differently_in_two_cameras_never_pass(tmp_path, camera, shift):
     """Where the motion is slow the residuals hardly show it: all poses combine points of different instants."""
     folder = points_run(tmp_path / "run", frames=24)

@@ -37,6 +37,7 @@ from lab.runs.setup_check import SampledFrames, frames_of
 from lab.simulate.scenarios import fan, unequal_fan
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit, write_run
+from tests.marks import further_slow
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 from tracking.setup_mistakes import evidence
@@ -260,7 +261,7 @@ def test_poses_that_the_limited_search_misses_in_a_crowd_are_no_evidence_for_a_m
     assert not found.found
 
 
-@pytest.mark.parametrize(("seed", "camera"), [(6113, "left"), (5113, "left1")])
+@pytest.mark.parametrize(("seed", "camera"), further_slow([(5113, "left1"), (6113, "left")]))
 def test_turned_pictures_are_named_although_spots_are_hidden_or_few(monkeypatch, seed, camera):
     """6113: half of the spots of another camera are hidden. 5113: six frames with four spots are no evidence.
 
@@ -376,7 +377,7 @@ def test_the_other_cameras_are_not_blamed_for_one_that_shows_nothing(tmp_path, r
     assert "BP-M0" not in text
 
 
-@pytest.mark.parametrize("aside_deg", [0.0, 180.0])
+@pytest.mark.parametrize("aside_deg", further_slow([180.0, 0.0]))
 def test_false_points_of_a_camera_are_reported_only_where_the_poses_put_spots_into_its_pictures(
     tmp_path, recording, compared_once, aside_deg
 ):
@@ -533,7 +534,9 @@ def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
     assert re.search(CASE[name].words, outcome.verdict.texts[0])
 
 
-@pytest.mark.parametrize("name", ["turned by 90 deg", "prior in radians", "the ends of a beam exchanged"])
+@pytest.mark.parametrize(
+    "name", further_slow(["turned by 90 deg", "prior in radians", "the ends of a beam exchanged"], fast=2)
+)
 def test_four_spots_of_a_vehicle_at_rest_are_enough_evidence(tmp_path, name):
     """All frames are alike: 17.5 nats. Few of the prior's poses let the rig see its spots: they compare no rigs."""
     run = write_run_folder(random_scene(8116, 40), tmp_path / "run")
@@ -547,7 +550,7 @@ def test_a_prior_refers_to_the_first_frame_and_not_to_the_second(tmp_path):
     assert "BP-M06" not in checked(run)[0]
 
 
-@pytest.mark.parametrize("seed", [95245, 95277])
+@pytest.mark.parametrize("seed", further_slow([95277, 95245]))
 def test_spots_that_are_hidden_in_one_of_two_pictures_are_no_wrong_numbers(tmp_path, seed):
     """Of a vehicle that moves by less than two pixels per frame the next picture shows them, and fits as well."""
     run = write_run_folder(random_scene(seed), tmp_path / "run")

@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from geometry.arrays import Array
+from tests.marks import further_slow
 from tests.tracking.rendering import round_lights
 from tracking.background.behind_lights import BehindLights, Exposures, _lights_of
 from tracking.background.estimation import PICTURES, static_background
@@ -136,7 +137,7 @@ def test_a_light_at_rest_is_marked_if_others_move():
             assert bool(d.at_rest is not None and d.at_rest[at].any()) == marked
 
 
-@pytest.mark.parametrize(("length_px", "largest_px"), [(3.0, 0.15), (25.0, 0.15), (160.0, 0.06)])
+@pytest.mark.parametrize(("length_px", "largest_px"), further_slow([(3.0, 0.15), (160.0, 0.06), (25.0, 0.15)], fast=2))
 def test_a_board_that_modulates_spots_by_half_does_not_shift_them(length_px, largest_px):
     """Whether they stay near its edges, or pass over them."""
     paths = over_edges(45, length_px)
@@ -235,7 +236,7 @@ def speckled_pictures(paths: Array, sigma_px: float, contrast: float, seed: int)
     return [np.rint(m + 0.5 * rng.standard_normal(SIZE)).clip(0, 255).astype(np.uint8) for m in mean]
 
 
-@pytest.mark.parametrize("step_px", [3.0, 5.0, 8.0])
+@pytest.mark.parametrize("step_px", further_slow([5.0, 3.0, 8.0]))
 def test_a_speckled_spot_that_makes_one_step_of_about_its_width_is_found_where_it_is(step_px):
     """Half of the recording before the step, half after it: both places have light in common that never moves."""
     paths = np.array([[100.3, 60.2], [180.3, 140.2], [260.3, 220.2], [59.3, 260.2]]) + np.zeros((46, 1, 2))
@@ -250,7 +251,7 @@ def test_a_speckled_spot_that_makes_one_step_of_about_its_width_is_found_where_i
     assert np.mean(gap < 3.5 * sigma) > 0.95
 
 
-@pytest.mark.parametrize("away_px", [6.0, 8.0, 12.0])
+@pytest.mark.parametrize("away_px", further_slow([6.0, 12.0, 8.0], fast=2))
 @pytest.mark.parametrize("modulated", [0.0, 0.5])
 def test_a_spot_at_rest_on_an_even_square_is_one_point_whose_sigma_is_not_that_of_the_edge_beside_it(
     away_px, modulated
@@ -305,7 +306,7 @@ def test_a_wide_spot_that_single_pictures_show_in_part_is_measured_in_the_differ
     assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
 
 
-@pytest.mark.parametrize(("start", "length_px"), [(10, 1.0), (15, 1.0), (25, 1.4)])
+@pytest.mark.parametrize(("start", "length_px"), further_slow([(25, 1.4), (10, 1.0), (15, 1.0)]))
 def test_a_narrow_spot_that_moves_by_its_width_is_one_point(start, length_px):
     """The places that it has in the recording overlap: that part of its light looks like a light at rest."""
     share = np.clip((np.arange(45.0) - start) / 15, 0, 1)[:, None, None] * length_px

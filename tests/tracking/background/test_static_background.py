@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tests.marks import further_slow
 from tests.tracking.rendering import round_lights
 from tracking.background import estimation, mean_pictures
 from tracking.background.estimation import PICTURES, EqualLight, static_background
@@ -154,7 +155,7 @@ def test_constant_light_is_constant_though_the_noise_of_a_picture_is_in_the_mean
 
 
 @pytest.mark.parametrize(("peak", "sigma_px"), [(150.0, 1.1), (40.0, 1.6)])
-@pytest.mark.parametrize("grain_px", [0.6, 1.5, 2.5])
+@pytest.mark.parametrize("grain_px", further_slow([1.5, 0.6, 2.5]))
 def test_lights_at_rest_have_errors_of_their_places_which_their_own_light_hides(peak, sigma_px, grain_px):
     """Texture under a light is in its fit; what is left shows nothing of it."""
     square, (u, v) = [], np.meshgrid(np.arange(40.0, 460, 60), np.arange(160.0, 340, 60))

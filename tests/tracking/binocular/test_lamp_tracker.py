@@ -20,6 +20,7 @@ from studies.fu2016 import (
     projected,
     render,
 )
+from tests.marks import further_slow
 from tracking.binocular.acquisition import observations
 from tracking.binocular.histories import _has_its_lights, _relative_motion
 from tracking.binocular.joint_fit import MarkerObservations
@@ -115,7 +116,7 @@ def approach(count, seed, *, lamps=4, moving=1.0):
         yield np.concatenate([start + t * speed, seen]) + rng.normal(0, 0.05, (9, 2))
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", further_slow([11, 12]))
 def test_four_lamps_among_five_other_lights_are_found_when_the_lights_have_moved(seed):
     tracker = tracker_of(list(approach(25, seed)))
     frames = [tracker.step(BLACK) for _ in range(25)]
@@ -126,7 +127,7 @@ def test_four_lamps_among_five_other_lights_are_found_when_the_lights_have_moved
             np.testing.assert_array_equal(frame.tracked.index[0], [5, 6, 7, 8, -1])
 
 
-@pytest.mark.parametrize(("lamps", "moving"), [(4, 0.0), (0, 1.0)])
+@pytest.mark.parametrize(("lamps", "moving"), further_slow([(4, 0.0), (0, 1.0)]))
 def test_lights_at_rest_and_other_lights_give_no_pose_however_many_pictures(lamps, moving):
     tracker = tracker_of(list(approach(10, 13, lamps=lamps, moving=moving)))
     assert {tracker.step(BLACK).status for _ in range(10)} == {PoseStatus.LOST}
@@ -166,7 +167,7 @@ def test_a_pose_is_continued_by_its_own_lights_alone():
     assert not _has_its_lights(of(0, 1, 2, 3), of(0, 1, 2, 4), (images, MarkerImages.none()))
 
 
-@pytest.mark.parametrize("others", [12, 18])
+@pytest.mark.parametrize("others", further_slow([12, 18]))
 def test_lamps_among_lights_that_are_all_brighter_are_found(others):
     rng = np.random.default_rng(others)
     for _ in range(3):

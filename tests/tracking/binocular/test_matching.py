@@ -10,6 +10,7 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance, perturbed_camera
 from studies.zhou2020 import random_pose
+from tests.marks import further_slow
 from tests.tracking.binocular.scenes import MODEL, NOISE_PX, PAIR, images, pose_at
 from tracking.binocular.acquisition import matching_pairs, mirrored
 from tracking.binocular.calibration_check import FittedFrame, clock_offset
@@ -62,7 +63,7 @@ def consistent(pose, frame):
     return delta @ np.linalg.solve(frame.covariance, delta) < 40  # chi-square with 6 dof: p = 5e-7
 
 
-@pytest.mark.parametrize("case", [((), ()), ((0,), ()), ((2,), (5,)), ((1, 4), (1, 4))])
+@pytest.mark.parametrize("case", further_slow([[(), ()], [(0,), ()], [(2,), (5,)], [(1, 4), (1, 4)]], fast=3))
 def test_hidden_and_false_markers_do_not_mislabel_the_others(case):
     rng = np.random.default_rng(1)
     pose = pose_at(9, 1)
@@ -259,7 +260,7 @@ def test_two_equal_targets_are_ambiguous_until_one_is_followed():
     assert consistent(one, followed)
 
 
-@pytest.mark.parametrize("seed", [30, 45])
+@pytest.mark.parametrize("seed", further_slow([45, 30]))
 def test_a_wrong_calibration_gives_no_turned_pose_of_half_of_the_markers(seed):
     """Each picture alone shows the whole target; a pose of some markers that agrees in both is another one."""
     names = [f"cameras.{c.name}.{p}" for c in PAIR.cameras for p in ("fx", "fy", "cx", "cy")]

@@ -30,8 +30,8 @@ def discs(
 
 
 def textured(rng: np.random.Generator, centre: Sequence[float], radius: float, coarse_px: float) -> NDArray[np.uint8]:
-    """A disc whose grey values are a smooth random field (sigma 22 DN), before an even grey; 4 x 4 samples a pixel."""
-    n = 4
+    """A disc whose grey values are a smooth random field (sigma 22 DN), before an even grey; 2 x 2 samples a pixel."""
+    n = 2
     v, u = (np.mgrid[: 120 * n, : 160 * n] + 0.5) / n - 0.5
     field = cv2.GaussianBlur(rng.normal(size=v.shape), (0, 0), n * coarse_px)
     inside = np.hypot(u - centre[0], v - centre[1]) < radius

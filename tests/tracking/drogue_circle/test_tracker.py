@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from tests.marks import further_slow
 from tests.tracking.drogue_circle.discs import BLUR_PX, BRIGHT, GREY, covered, discs, rounded, textured
 from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, Window, classical_detector
 from tracking.drogue_circle.printed import PrintedTracker
@@ -148,7 +149,7 @@ def test_without_a_circle_in_view_nothing_is_reported(picture):
         assert (frame.status, frame.cause) == (PoseStatus.LOST, Cause.NOT_FOUND)
 
 
-@pytest.mark.parametrize("wave_px", [0.7, 0.9])
+@pytest.mark.parametrize("wave_px", further_slow([0.9, 0.7]))
 def test_an_outline_that_is_a_circle_in_one_picture_only_is_not_followed(wave_px):
     """Crowns of trees of 11 px pass for a circle by chance, with .26 px, and have .3 to .9 px in the next pictures."""
     x, y = np.meshgrid(np.arange(160.0) - 80, np.arange(120.0) - 60)

@@ -68,7 +68,7 @@ def amplitude(error: np.ndarray, places: np.ndarray) -> float:
     return float(np.mean(waves))
 
 
-@pytest.mark.parametrize("parts", [WINGED[0], pytest.param(WINGED[1], marks=pytest.mark.slow), WINGED[2]])
+@pytest.mark.parametrize("parts", [WINGED[0], *(pytest.param(w, marks=pytest.mark.slow) for w in WINGED[1:])])
 def test_with_their_profile_the_error_depends_less_on_the_place_within_a_pixel(parts):
     shown, centres = recording(parts)
     model = estimate_noise(shown).model

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tests.marks import further_slow
 from tests.tracking.rendering import round_lights
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
@@ -55,7 +56,9 @@ def spots(sigma_px: float, peak: float, seed: int) -> tuple[Array, Array]:
     return centres, round_lights(SIZE, centres, peak, sigma_px)
 
 
-@pytest.mark.parametrize(("sigma_px", "grain_px"), [(1.5, 1.0), (3.0, 1.5), (6.0, 1.0), (9.0, 1.0)])
+@pytest.mark.parametrize(
+    ("sigma_px", "grain_px"), further_slow([(1.5, 1.0), (9.0, 1.0), (3.0, 1.5), (6.0, 1.0)], fast=2)
+)
 @pytest.mark.parametrize("peak", [6000.0, 300.0])
 def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_px, grain_px, peak):
     errors, expected = [], []
@@ -74,7 +77,7 @@ def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_p
 
 
 @pytest.mark.parametrize("brightness", [3.0, 10.0])
-@pytest.mark.parametrize(("sigma_px", "grain_px"), [(1.6, 1.2), (3.0, 1.5), (1.6, 6.0)])
+@pytest.mark.parametrize(("sigma_px", "grain_px"), further_slow([(1.6, 1.2), (1.6, 6.0), (3.0, 1.5)], fast=2))
 def test_fits_that_give_bright_pixels_less_weight_have_smaller_errors_on_fine_texture(sigma_px, grain_px, brightness):
     """As a share of those of fits with equal weights; coarse texture shifts all of a spot, whatever the weights."""
     errors, expected, peak = np.zeros((2, 0)), [], 6000.0

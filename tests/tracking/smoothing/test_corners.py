@@ -12,6 +12,7 @@ from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from lab.simulate.points import PointRun
 from lab.simulate.scenarios import RIGS, PriorRegion
+from tests.marks import further_slow
 from tests.tracking.rigid_runs import (
     RIGID,
     Assessment,
@@ -69,7 +70,7 @@ def cached_zig_zag(seed: int, frames: int, rate_hz: float, every: int) -> tuple[
     return zig_zag(seed, frames, rate_hz, every, HARD, START)
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
+@pytest.mark.parametrize("share", further_slow([0.5, 0.05, 0.2]))
 def test_a_corner_within_an_exposure_does_not_shift_the_pose_beyond_its_sigma(share):
     """A spot's mean over the exposure lies beside the corner, by up to an eighth of the exposure times the jump."""
     parts, frames, rate_hz = 100, 120, 100.0
@@ -128,7 +129,9 @@ def errors_of_a_swing(seed: int, share: float, hz: float, rad: float) -> tuple[A
     return error, np.einsum("ki,kij,kj->k", error, np.linalg.inv(result.covariance), error) / 6
 
 
-@pytest.mark.parametrize(("hz", "rad", "seed"), [(6.0, 0.1, 1), (6.0, 0.1, 2), (9.0, 0.03, 1), (6.0, 0.03, 1)])
+@pytest.mark.parametrize(
+    ("hz", "rad", "seed"), further_slow([(9.0, 0.03, 1), (6.0, 0.1, 1), (6.0, 0.1, 2), (6.0, 0.03, 1)], fast=2)
+)
 def test_a_fast_swing_is_no_series_of_corners(hz, rad, seed):
     """Of a corner within an exposure nothing shows where it is; a swing in long exposures is as exact as in short ones.
 

@@ -9,6 +9,7 @@ import pytest
 
 from geometry.arrays import Array
 from geometry.pose import Pose
+from tests.marks import further_slow
 from tracking.rigid_body.models.motion import ANY_MOMENT, STATE, predicted, updated
 from tracking.smoothing.motion import fixed_interval
 from tracking.smoothing.motion.fixed_interval import (
@@ -238,7 +239,7 @@ def test_the_last_frame_agrees_with_the_filter():
     np.testing.assert_allclose((motion_P[-1] - P[6:12, 6:12]) / np.outer(sigma[6:12], sigma[6:12]), 0, atol=1e-6)
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 12, 24, 25])
+@pytest.mark.parametrize("chunk", further_slow([7, 12, 24, 25, 1], fast=4))
 def test_the_size_of_the_chunks_does_not_change_the_result(chunk, monkeypatch):
     run = drawn(7, 24, without_spots=slice(5, 8))
     compiled = smoothed(run.ref, run.info, run.jerk, True)  # all in one chunk

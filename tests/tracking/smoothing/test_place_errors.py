@@ -10,6 +10,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import PINHOLE, RigCovariance, perturbed_rig, rig_names, split_name
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
 from lab.simulate.scenarios import RIGS, PriorRegion
+from tests.marks import further_slow
 from tests.tracking.rigid_runs import assess, recording_of, smoothed_frames, tracked, zig_zag
 from tracking.detections import Detections
 from tracking.smoothing.place_errors import correlation, more_of_means, place_errors
@@ -211,7 +212,7 @@ def with_other_rig(run: PointRun, seed: int) -> tuple[Rig, RigCovariance]:
     return perturbed_rig(run.rig, names, drawn), RigCovariance(names, np.diag(sigma**2))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", further_slow(range(4), fast=2))
 def test_calibration_errors_change_neither_the_noise_of_the_poses_nor_the_errors_of_places(seed):
     """Spots of .01 px, .05 px off by a calibration that says so: taken for errors of places, 2.9 times the sigmas."""
     run = simulate_points("small-motion", seed, frames=100, noise_px=0.01, clutter=0.0)

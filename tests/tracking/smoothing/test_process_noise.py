@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tests.marks import further_slow
 from tests.tracking.smoothing.test_fixed_interval import Run, drawn
 from tracking.smoothing.motion.fixed_interval import smoothed
 from tracking.smoothing.motion.process_noise import LOG_RANGE, next_log_density
@@ -100,7 +101,7 @@ def test_steps_with_a_velocity_jump_are_left_out():
     assert np.all(with_jump[150] > without_jump[150])
 
 
-@pytest.mark.parametrize(("amplitude", "largest"), [(0.0, 1.4), (0.3, 1.6), (0.6, 1.5)])
+@pytest.mark.parametrize(("amplitude", "largest"), further_slow([(0.3, 1.6), (0.6, 1.5), (0.0, 1.4)], fast=2))
 def test_covariances_are_right_where_one_axis_moves_less_than_the_noise(amplitude, largest):
     """amplitude: of a sine in the rotation about x, in sigmas of one frame's own pose."""
     jerk = np.array([20.0, 50.0, 50.0, 1e-4, 100.0, 100.0]) ** 2

@@ -7,6 +7,7 @@ import pytest
 
 from geometry.arrays import Array
 from geometry.compiled_linalg import cholesky, posterior
+from tests.marks import further_slow
 from tracking.rigid_body.models.motion import STATE
 from tracking.smoothing.motion.fixed_interval import RunInformation, filtered, log_likelihood, smoothed
 from tracking.smoothing.motion.run_detections import Reference, unknown_moments
@@ -95,7 +96,7 @@ def ratios(P: Array, true: Array) -> Array:
     return np.linalg.eigvalsh((half @ P.astype(np.longdouble) @ half.T).astype(float))
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", further_slow(range(25), fast=10))
 def test_covariances_are_those_of_extended_precision(seed):
     """Jerks of 1e-3 to 1e9, steps of 1e-6 to 1 s, information of 1e-2 to 1e12."""
     still, info, jerk, rows, _ = extreme(seed, NEAR)

@@ -68,6 +68,7 @@ def test_the_smoothing_pass_labels_no_fewer_spots_and_none_wrongly(scenario, hid
     assert again.wrong == 0
 
 
+@pytest.mark.slow
 def test_a_false_point_beside_spots_of_one_camera_gives_no_pose_once_in_an_occlusion():
     """The spots of one camera do not determine the pose; each spot of the other has a false point near it."""
     scene = random_scene(31323)

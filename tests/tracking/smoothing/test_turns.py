@@ -54,6 +54,7 @@ def test_the_error_of_a_turn_is_as_stated_and_a_part_of_a_frame():
     assert all(turn.length_s < DT for turn, _ in known)
 
 
+@pytest.mark.slow
 def test_poses_at_a_turn_without_spots_have_the_errors_that_they_state():
     """As the moment of a jump: the spots of both frames beside its step are missing, as in a gap of two frames."""
     nees, errors = [], []

@@ -19,7 +19,7 @@ from lab.results.view import page as view_module
 from lab.results.view.page import read_content, scene_data, show, view_of, write_glb, write_page
 from tests.lab.fake_results import make
 from tests.lab.simulate.test_own_motion import elsewhere
-from tests.open3d_marker import needs_open3d
+from tests.marks import needs_open3d
 
 
 @pytest.fixture(scope="module")

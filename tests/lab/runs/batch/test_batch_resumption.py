@@ -157,6 +157,7 @@ def killed_then_resumed(recordings, tmp_path: Path, seconds: float) -> None:
     assert "error" not in {r["status"] for r in rows_of(done.table)}
 
 
+@pytest.mark.slow
 def test_a_killed_batch_is_resumed_to_the_same_bytes(recordings, tmp_path):
     killed_then_resumed(recordings, tmp_path, 3.0)
 

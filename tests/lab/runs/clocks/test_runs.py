@@ -18,6 +18,7 @@ from geometry.pose import Pose
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tests.marks import further_slow
 from tracking.smoothing.motion.clocks import DETERMINED
 from tracking.smoothing.smoother import _Smoother
 
@@ -102,7 +103,7 @@ def test_a_camera_of_another_rate_needs_only_its_times(recording, tmp_path):
 
 
 @pytest.mark.usefixtures("no_search")
-@pytest.mark.parametrize("scatter_s", [0.0, 2e-4])
+@pytest.mark.parametrize("scatter_s", further_slow([2e-4, 0.0]))
 def test_the_errors_of_stamps_are_in_the_poses(scatter_s, tmp_path):
     """Fast motion at 413 Hz: one stamp off by half a step, or all by a twelfth: 4 and .7 px, of spots to .15 px."""
     r = random_recording(41061, frames=60)
@@ -136,6 +137,7 @@ def test_four_spots_seen_by_free_running_cameras_are_found(tmp_path):
     assert read_poses(tmp_path / "out").has("measured").sum() >= 8
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_search")
 def test_smooth_motion_is_averaged_over_as_many_frames_as_with_one_clock(tmp_path):
     """Sines of 0.6 Hz at 205 Hz, with nothing hidden: between the spots they are much smoother than white jerk."""
@@ -170,7 +172,7 @@ def test_a_swing_that_begins_after_rest_leaves_no_frame_vague(tmp_path):
 
 
 @pytest.mark.usefixtures("no_search")
-@pytest.mark.parametrize("seed", [4000, 4033])
+@pytest.mark.parametrize("seed", further_slow([4000, 4033]))
 def test_beside_corners_the_attitude_is_as_accurate_as_with_one_clock(seed, tmp_path):
     """The pictures around a corner are before or after it: each belongs to the motion on its side."""
     r = random_recording(seed, frames=80)
@@ -204,7 +206,7 @@ def rounded(r: Recording, frames: float) -> Recording:
 
 
 @pytest.mark.usefixtures("no_search")
-@pytest.mark.parametrize(("turn", "frames"), [(1.0, 40), (3.0, 80)])
+@pytest.mark.parametrize(("turn", "frames"), further_slow([(1.0, 40), (3.0, 80)]))
 def test_turns_that_take_some_frames_are_not_taken_for_corners(turn, frames, tmp_path):
     own = figures(rounded(random_recording(4000, frames=frames), turn), tmp_path)
     assert np.nanmean(own.nees) < 1.5
@@ -223,6 +225,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_search")
 def test_slow_cameras_lose_no_poses_where_nothing_jumps(tmp_path, monkeypatch):
     """One camera of full rate and two of 30 Hz: jumps could hide in every step, and there are some in a few steps.
@@ -241,6 +244,7 @@ def test_slow_cameras_lose_no_poses_where_nothing_jumps(tmp_path, monkeypatch):
     assert np.nanmean(own.nees) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_search")
 def test_a_turn_that_takes_about_a_frame_is_as_long_as_it_is(tmp_path):
     """A turntable: one jump explains neither the rest before it and after it nor the spots in between."""
@@ -269,7 +273,7 @@ def test_a_swing_after_a_long_rest_is_no_succession_of_jumps(seed, frames, tmp_p
 
 
 @pytest.mark.usefixtures("no_search")
-@pytest.mark.parametrize("gap", [slice(12, 26), slice(8, 22)])
+@pytest.mark.parametrize("gap", further_slow([slice(12, 26), slice(8, 22)]))
 def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
     """That it is in one half of the gap does not exclude it from the other."""
     r = random_recording(6005, frames=60)
@@ -282,7 +286,7 @@ def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
 
 
 @pytest.mark.usefixtures("no_search")
-@pytest.mark.parametrize("seed", [6012, 6043])
+@pytest.mark.parametrize("seed", further_slow([6012, 6043]))
 def test_a_turn_that_the_spots_allow_to_be_short_is_in_the_sigmas(seed, tmp_path):
     """A turn that lasts for as long as they allow, or a jerk in its place, rounds the corners of a turntable."""
     own = figures(random_recording(seed, frames=60), tmp_path)

@@ -24,6 +24,7 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.files.rig.rig_file import load_rig
 from lab.pictures.delivery import without_repeats
+from tests.marks import further_slow
 from tests.tracking.rendering import round_lights
 from tracking.background.camera_motion import CameraMotion, shift_between
 from tracking.noise import NoiseModel
@@ -158,7 +159,8 @@ def test_cameras_that_shake_are_named_and_their_poses_are_as_good_as_their_sigma
 
 
 @pytest.mark.parametrize(
-    ("step_at", "wall"), [(4, False), (FRAMES // 2, False), (FRAMES - 6, False), (FRAMES // 2, True)]
+    ("step_at", "wall"),
+    further_slow([(FRAMES // 2, False), (FRAMES // 2, True), (4, False), (FRAMES - 6, False)], fast=2),
 )
 def test_cameras_that_are_moved_during_a_recording_are_named_and_the_sigmas_contain_the_step(tmp_path, step_at, wall):
     """Which of the two attitudes is that of the calibration cannot be seen; the truth here is the first."""
@@ -180,6 +182,7 @@ def test_cameras_that_are_moved_during_a_recording_are_named_and_the_sigmas_cont
     assert [n["moved_between"] for n in named.values()] == [[step_at - 1, step_at]] * 2
 
 
+@pytest.mark.slow
 def test_cameras_that_are_moved_by_many_pixels_are_named(tmp_path):
     """They are not corrected: with all of them moved alike, the later spots fit a wrong pose."""
     moved = Unsteady(step_px=25.0, step_at=FRAMES // 2)
@@ -190,7 +193,7 @@ def test_cameras_that_are_moved_by_many_pixels_are_named(tmp_path):
     assert [n["moved_px"] for n in named] == pytest.approx([25.0 * np.sqrt(2)] * 2, rel=0.1)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("share", further_slow([0.5, 0.0]))
 def test_cameras_that_average_their_pictures_over_time_are_named(tmp_path, share):
     """A filter against noise takes this share of each picture from the one before; all spots then lag by a picture."""
     folder, _ = recording(tmp_path / "run")
@@ -251,6 +254,7 @@ def door_opens(frame: int) -> Any:
     return 1 + 0.8 * (frame >= FRAMES // 2) * ((columns > 110) & (columns < 200))
 
 
+@pytest.mark.slow
 def test_spots_are_found_where_the_room_changes_during_the_recording(tmp_path):
     """No background fits both halves of the recording there: the pictures themselves show the spots."""
     folder, truth = recording(tmp_path / "run", left=Unsteady(light=door_opens), right=Unsteady(light=door_opens))
@@ -262,17 +266,31 @@ def test_spots_are_found_where_the_room_changes_during_the_recording(tmp_path):
     assert (spots.groupby(["camera", "spot"]).status.agg(lambda s: (s == "matched").mean()) > 0.75).all()
 
 
-def test_light_in_bands_hides_no_spot_and_somebody_who_walks_past_hides_some_and_causes_no_wrong_pose(tmp_path):
-    folder, truth = recording(tmp_path / "run", left=Unsteady(light=in_bands), right=Unsteady(walks=True))
-    summary = processed(folder, tmp_path / "out")
+def test_light_in_bands_hides_no_spot(tmp_path):
+    folder, truth = recording(tmp_path / "run", left=Unsteady(light=in_bands))
+    matched = shares_of_a_run_without_wrong_poses(folder, truth)
+    assert matched["left"] > 0.97
+
+
+@pytest.mark.slow
+def test_somebody_who_walks_past_hides_some_spots_and_causes_no_wrong_pose(tmp_path):
+    folder, truth = recording(tmp_path / "run", right=Unsteady(walks=True))
+    matched = shares_of_a_run_without_wrong_poses(folder, truth)
+    assert matched["left"] > 0.97
+    assert matched["right"] > 0.5
+
+
+def shares_of_a_run_without_wrong_poses(folder: Path, truth: Path) -> dict[str, float]:
+    """The share of matched rows of spots.csv, by camera; all poses are measured and have the errors that they state."""
+    out = folder.with_name("out")
+    summary = processed(folder, out)
     assert all(noise["background_pictures"] > 0 for noise in summary["parameters"]["noise"].values())
-    found = nees(tmp_path / "out", truth)
+    found = nees(out, truth)
     assert len(found) == FRAMES
     assert found.mean() < 2.0
     assert found.max() < 6.0
-    spots = pd.read_csv(tmp_path / "out" / "spots.csv")
-    assert (spots.status[spots.camera == "left"] == "matched").mean() > 0.97
-    assert (spots.status[spots.camera == "right"] == "matched").mean() > 0.5
+    spots = pd.read_csv(out / "spots.csv")
+    return {camera: float((of.status == "matched").mean()) for camera, of in spots.groupby("camera")}
 
 
 def test_pictures_that_repeat_the_one_before_wholly_or_in_part_have_no_spots(tmp_path):

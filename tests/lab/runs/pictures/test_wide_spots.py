@@ -17,6 +17,7 @@ from geometry.camera import Camera
 from geometry.planes import intersect_plane
 from geometry.rig import Screen
 from lab.files.rig.rig_file import load_rig
+from tests.marks import further_slow
 
 SIZE, FRAMES, WIDE_PX = (512, 640), 30, 38.0
 Y, X = np.mgrid[: SIZE[0], : SIZE[1]]
@@ -74,7 +75,7 @@ def recording(folder: Path, ground: np.ndarray) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("ground", [UNLIT, ROOM], ids=["unlit", "room"])
+@pytest.mark.parametrize("ground", further_slow([UNLIT, ROOM]), ids=["unlit", "room"])
 def test_a_spot_that_is_too_wide_is_named_with_the_value_that_admits_it(tmp_path, ground):
     """Not used, it leaves no wrong pose behind; with the stated value it is measured, and its pose is right."""
     folder = recording(tmp_path / "run", ground)

@@ -148,6 +148,7 @@ def test_an_address_that_cannot_be_used_is_named(address):
         server(address=address)
 
 
+@pytest.mark.slow
 def test_a_browser_that_reads_nothing_holds_up_nobody_and_a_late_one_gets_the_newest_state():
     made = []
 

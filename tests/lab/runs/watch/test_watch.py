@@ -185,6 +185,7 @@ def test_a_watch_that_has_not_kept_up_says_what_became_of_the_pictures(latency, 
     assert all(f"{latency.as_mapping()['last'] / 1e3:.1f} s after" in line and "are all used" in line for line in said)
 
 
+@pytest.mark.slow
 def test_pictures_that_come_faster_than_they_are_searched_wait_for_the_first_background(tmp_path):
     """On a rough screen spots are found in front of a background only: here from the first picture on."""
     rough = replace(SCENARIOS["smooth"], light=Light(texture=0.12, peak_dn=20.0, background_dn=40.0))
