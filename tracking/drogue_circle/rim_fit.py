@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from math import erf
 
 import cv2
@@ -50,6 +50,7 @@ class Rim:
 class RimPoints:
     """The edge on each of n rays at equal angles."""
 
+    about: Rim  # whose centre the rays start at
     theta: Array  # (n,) rad
     radius_px: Array  # (n,) distance from the centre; nan where no edge is found
     slope: Array  # (n,) DN/px along the ray, positive in the direction of the polarity; nan there, too
@@ -57,7 +58,13 @@ class RimPoints:
     spacing_px: float  # between neighbouring rays at the rim
     blur_px: float = 0.0  # sigma of the blurred edge
     common_px: float = 0.0  # shift of all edges by a slope inside the target, whose size is not known; 0: none
+    noise_px: float = 0.0  # error of the usual edge by the noise of the picture
     beside_gap: Bools | None = None  # (n,) edges that fit, but are left out since an occluder may end next to them
+
+    @property
+    def precision(self) -> Array:
+        """(n,) error of the usual edge over that of each, nan without one: noise and texture move it by 1 / slope."""
+        return self.slope / upper_median(self.slope[np.isfinite(self.slope)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +104,7 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     none = np.full(n, np.nan)
     height, width = crop.values.shape
     if not height:
-        return RimPoints(theta, none, none, none, spacing)
+        return RimPoints(rim, theta, none, none, none, spacing)
     offset = np.arange(-half_px - _STEP_PX, half_px + 1.5 * _STEP_PX, _STEP_PX)
     base = rim.radius_at(theta)
     distance = base[:, None] + offset
@@ -137,11 +144,12 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
         radius -= sigma**2 * away / height
         common = abs(sigma**2 * inner / upper_median(height[good]))
         common = common if common > _LEAST_COMMON_PX else 0.0
-    if hidden is None:
-        return RimPoints(theta, radius, strength, radius, spacing, sigma, common)
-    own = ~hidden[(rows * len(hidden)) // n]
-    seen = np.where(own, radius, np.nan)
-    return RimPoints(theta, seen, np.where(own, strength, np.nan), radius, spacing, sigma, common)
+    # The second derivative of filtered white noise over the third one of the edge at its steepest place.
+    noise = np.sqrt(0.75) * crop.noise_dn / crop.blur_px**2 * sigma**2
+    noise = noise / upper_median(strength[good]) if good.any() else 0.0
+    own = True if hidden is None else ~hidden[(rows * len(hidden)) // n]
+    seen, slopes = np.where(own, radius, np.nan), np.where(own, strength, np.nan)
+    return RimPoints(rim, theta, seen, slopes, radius, spacing, sigma, common, noise)
 
 
 def _beside(
@@ -197,6 +205,9 @@ def _edge_width(ratios_px: Array, half_px: float, least_px: float) -> float:
 _TUKEY = 4.685  # Tukey's biweight, 95 % efficiency for normal errors
 _LEAST_SIGMA_PX = 0.02  # of an edge point: interpolation, and pixels that are not points
 _MODEL_SIGMA_PX = 0.005  # of the fit: rims are not exact circles
+# Length of rim with one period of the errors that show the power of one turn, and least number of these in the rim. Of
+# 800 circles of four kinds NEES / 2 is 1.08, 1.02 and .99 with 30, 40 and 50 px.
+_PERIOD_PX, _LEAST_PERIODS = 40.0, 4.0
 _BLUR_SIGMA = 0.5  # 1 sigma of the correction for blur, as a share of it
 _ELLIPSE_COVERAGE = 0.7  # share of the rim that determines an ellipse
 _ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
@@ -221,6 +232,8 @@ class RimFit:
     polarity: int
     score: float  # coverage, reduced by residuals
     sectors: Array  # (SECTORS,) share of the rays of a sector whose edge lies on the rim, hidden ones too
+    # Share of the covariance that is not the picture's noise: texture and background move rims of the next ones alike.
+    lasting: float = 0.0
 
     @property
     def centre_and_radius(self) -> Array:
@@ -254,7 +267,7 @@ def fit_rim(
     least = 0.7 * min_coverage
     for half_px, scale_px in () if sure else _PASSES[:-1]:
         points = rim_points(crop, rim, min(half_px, 0.4 * rim.radius_px), coarse.polarity, hidden)
-        fitted = _solve(rim, points, scale_px, oblique=False)
+        fitted = _solve(points, scale_px, oblique=False)
         if fitted is None or np.mean(fitted[1] > 0) < least or not _is_near(fitted[0], coarse):
             return None
         moved = np.hypot(fitted[0].u_px - rim.u_px, fitted[0].v_px - rim.v_px)
@@ -262,17 +275,17 @@ def fit_rim(
         if moved < _ENOUGH_PX:
             break
     points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
-    circle = _solve(rim, points, 0.0, oblique=False)
+    circle = _solve(points, 0.0, oblique=False)
     if circle is not None and np.hypot(circle[0].u_px - rim.u_px, circle[0].v_px - rim.v_px) > _FAR_PX:
         rim = circle[0]
         points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
-        circle = _solve(rim, points, 0.0, oblique=False)
+        circle = _solve(points, 0.0, oblique=False)
     if circle is None:
         return None
     solved = None
     if _looks_oblique(points, circle[0]):
         solved = _oblique_fit(crop, circle, points, coarse.polarity, hidden)
-    rim, points, weight = solved or _without_ends(rim, points, circle, oblique=False)
+    rim, points, weight = solved or _without_ends(points, circle, oblique=False)
     return _described(rim, points, weight, coarse, min_coverage)
 
 
@@ -306,13 +319,13 @@ def _prior(points: RimPoints, sigma_px: float, count: int) -> Array:
     return out
 
 
-def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) -> tuple[Rim, Array] | None:
+def _solve(points: RimPoints, least_scale_px: float, oblique: bool) -> tuple[Rim, Array] | None:
     """Iteratively reweighted least squares with Tukey's weights. Returns the rim and the weights (n,) of the points.
 
     The points are distances from the old centre along rays; to first order the shift of the centre is linear in them,
     and the second-order term, the square of the tangential shift over twice the radius, is subtracted.
     """
-    found = np.flatnonzero(np.isfinite(points.radius_px))
+    found, rim = np.flatnonzero(np.isfinite(points.radius_px)), points.about
     A = _design(points, oblique)[found]
     count = A.shape[1]
     if len(found) < 3 * count:
@@ -345,10 +358,8 @@ def _solve(rim: Rim, points: RimPoints, least_scale_px: float, oblique: bool) ->
     return Rim(rim.u_px + float(x[0]), rim.v_px + float(x[1]), *map(float, x[2 : 5 if oblique else 3])), full
 
 
-def _without_ends(
-    start: Rim, points: RimPoints, fitted: tuple[Rim, Array], oblique: bool
-) -> tuple[Rim, RimPoints, Array]:
-    """A fit from `start` without the edges next to gaps of the rim, if it is possible; with its points and weights.
+def _without_ends(points: RimPoints, fitted: tuple[Rim, Array], oblique: bool) -> tuple[Rim, RimPoints, Array]:
+    """A fit without the edges next to gaps of the rim, if it is possible; with its points and weights.
 
     The blurred corner of rim and occluder moves the edges near it, to one side: within 1 sigma of blur by .3 px, and
     still at 3 sigma by .1 px (rings of 20 to 45 px, a fifth hidden by a plate).
@@ -359,7 +370,7 @@ def _without_ends(
     own = near & (fitted[1] > 0)
     if own.any():
         trimmed = replace(points, radius_px=np.where(near, np.nan, points.radius_px), beside_gap=own)
-        again = _solve(start, trimmed, 0.0, oblique)
+        again = _solve(trimmed, 0.0, oblique)
         if again is not None:
             return again[0], trimmed, again[1]
     return fitted[0], points, fitted[1]
@@ -370,17 +381,17 @@ def _oblique_fit(
 ) -> tuple[Rim, RimPoints, Array] | None:
     """The fit with the two parameters of an ellipse, if they explain the residuals better than chance does."""
     before = _sum_of_squares(circle[0], points, circle[1])
-    once = _solve(circle[0], points, 1.0, oblique=True)
+    once = _solve(points, 1.0, oblique=True)
     if once is None or np.hypot(once[0].cos2_px, once[0].sin2_px) > 0.25 * circle[0].radius_px:
         return None
     again = rim_points(crop, once[0], 2.0, polarity, hidden)
-    final = _solve(once[0], again, 0.0, oblique=True)
+    final = _solve(again, 0.0, oblique=True)
     if final is None or np.mean(final[1] > 0) < _ELLIPSE_COVERAGE:
         return None
     together = max(CORRELATED_PX / max(again.spacing_px, 0.3), 1.0)  # points with one error
     independent = max(float(np.count_nonzero(final[1])) / together - 5, 1.0)
     gained = before / max(_sum_of_squares(final[0], again, final[1]), 1e-12) - 1
-    return _without_ends(once[0], again, final, oblique=True) if 0.5 * gained * independent > _ELLIPSE_F else None
+    return _without_ends(again, final, oblique=True) if 0.5 * gained * independent > _ELLIPSE_F else None
 
 
 def _looks_oblique(points: RimPoints, rim: Rim) -> bool:
@@ -408,23 +419,26 @@ def _residuals(rim: Rim, points: RimPoints) -> Array:
 def _described(
     rim: Rim, points: RimPoints, weight: Array, coarse: CircleCandidate, min_coverage: float
 ) -> RimFit | None:
-    """The fit with its covariance; None where it covers too little of the rim."""
+    """The fit with its covariance; None where it covers too little of the rim.
+
+    rim: of equal weights, which choose the edges. The circle is that with weights of their precision.
+    """
     good = weight > 0
     fits = good if points.beside_gap is None else good | points.beside_gap
     coverage = float(np.mean(fits))
     if coverage < min_coverage:
         return None
     oblique = bool(rim.cos2_px or rim.sin2_px)
-    A = _design(points, oblique)[good]
-    count = A.shape[1]
-    away = _residuals(rim, points)
-    prior = _prior(points, float(np.std(away[good])), count)
-    away[good] -= A @ np.linalg.solve(A.T @ A + prior, A.T @ away[good])
-    residual = away[good]
-    correlated = _correlation_length(away, good, points.spacing_px)
-    independent = max(len(residual) / correlated, count + 3.0)
-    variance = max(float(np.mean(residual**2)), _LEAST_SIGMA_PX**2) * independent / (independent - count)
-    covariance = variance * correlated * np.linalg.inv(A.T @ A + prior)
+    precision = points.precision
+    A = (_design(points, oblique) * precision[:, None])[good]
+    away = _residuals(points.about, points) * precision
+    prior = _prior(points, float(np.std(away[good])), A.shape[1])
+    weighted = A * weight[good, None]
+    x = np.linalg.solve(weighted.T @ A + prior, weighted.T @ away[good])
+    away[good] -= A @ x
+    power = _error_power(np.where(good, away, 0.0), good, points.spacing_px)
+    covariance = np.asarray(power * np.linalg.inv(A.T @ A + prior), float)
+    lasting = max(1 - points.noise_px**2 * max(CORRELATED_PX / points.spacing_px, 1.0) / power, 0.0)
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
     covariance[2, 2] += (_BLUR_SIGMA * points.blur_px**2 / (2 * max(rim.radius_px, 1.0))) ** 2 + points.common_px**2
     rms = float(np.sqrt(_sum_of_squares(rim, replace(points, radius_px=points.any_radius_px), fits)))
@@ -432,22 +446,25 @@ def _described(
     sector = np.arange(len(on_rim)) * SECTORS // len(on_rim)
     sectors = np.bincount(sector, on_rim, SECTORS) / np.maximum(np.bincount(sector, minlength=SECTORS), 1)
     beside = coverage - float(np.mean(good))
-    return RimFit(rim, covariance, coverage, rms, beside, coarse.polarity, coverage / (1 + rms), sectors)
+    before = np.array(astuple(points.about)[: 5 if oblique else 3])
+    best, score = Rim(*(before + x[: len(before)]).tolist()), coverage / (1 + rms)
+    return RimFit(best, covariance, coverage, rms, beside, coarse.polarity, score, sectors, lasting)
 
 
-def _correlation_length(away: Array, good: Bools, spacing_px: float) -> float:
-    """Number of neighbouring edge points that count as one: 1 + 2 sum of the correlations (Bartlett's weights).
+def _error_power(away: Array, good: Bools, spacing_px: float) -> float:
+    """Variance of an edge point, px^2, times the number of neighbours that count as one: of the errors (n,) of a fit.
 
-    At least 1.8 points 1 px apart, measured: white noise behind the Gaussian filter has the correlation
-    exp(-d^2 / 4 sigma^2), whose sum is 3.5, but the errors of pixels and interpolation are less correlated.
+    It is the power of the errors at one period per turn, which moves a centre. The fit leaves nothing there: it is
+    that of more periods, with weights that fall to .6 where one is _PERIOD_PX long. Estimated like this, a variance is
+    divided by its degrees of freedom less 2, as that of Student's distribution. At least 1.8 points 1 px apart count as
+    one, measured: white noise behind the Gaussian filter has the correlation exp(-d^2 / 4 sigma^2), whose sum is 3.5,
+    but the errors of pixels and interpolation are less correlated.
     """
-    least = max(1.8 / spacing_px, 1.0)
-    values = np.where(good, away, 0.0) - np.where(good, np.mean(away[good]), 0.0)
-    power = float(np.sum(values**2))
-    if power <= 0:
-        return least
-    lags = int(min(max(12 / spacing_px, 4), len(away) // 6))
-    # The products of all pairs at one distance, around the rim: the inverse transform of the power spectrum.
-    products = np.fft.irfft(np.abs(np.fft.rfft(values)) ** 2, len(values))[1 : lags + 1]
-    total = 1 + 2 * float(np.sum((1 - np.arange(1, lags + 1) / (lags + 1)) * products)) / power
-    return max(total, least)
+    count = np.count_nonzero(good)
+    spectrum = np.abs(np.fft.rfft(away)) ** 2 / count
+    periods = np.arange(len(spectrum))
+    shown = max(len(away) * spacing_px / _PERIOD_PX, _LEAST_PERIODS)
+    share = np.exp(-0.5 * (periods / shown) ** 2) * (periods >= 2)
+    freedom = 2 * share.sum() ** 2 / (share @ share) * count / len(away)
+    power = float(share @ spectrum / share.sum() * freedom / max(freedom - 2, 1.0))
+    return max(power, max(1.8 / spacing_px, 1.0) * max(float(away @ away) / count, _LEAST_SIGMA_PX**2))

@@ -262,6 +262,14 @@ class Track:
         habit = RimHabit(fit.sectors, fit.rms_px, 1)
         return cls(_bank_at(fit, p), first_appearance(*cells), habit, fit, cells)
 
+    def state(self) -> tuple[Array, Array]:
+        """State (6,) and covariance (6, 6), with what averaging over pictures does not reduce of the last fit's."""
+        x, P = self.bank.state()
+        R = self.fit.covariance_px2
+        averaged = max(1 - np.trace(P[:2, :2]) / np.trace(R[:2, :2]), 0.0)
+        P[:3, :3] += averaged * self.fit.lasting * R
+        return x, P
+
     def restart(self, fit: RimFit, p: CircleParameters) -> None:
         """Continue at another place; the target looks as before."""
         self.bank, self.fit, self.misses, self.measured = _bank_at(fit, p), fit, 0, 1
@@ -433,7 +441,7 @@ class CircleTracker:
             track.update(fit, gamma, self.parameters)
             if is_clear(gamma) and track.measured > _CONFIRMED:
                 self._trusted = fit
-            x, P = track.bank.state()
+            x, P = track.state()
             return CircleFrame(PoseStatus.MEASURED, Cause.NONE, x, P, predicted, fit, gamma)
         track.misses += 1
         if track.measured < _CONFIRMED <= track.misses:
@@ -490,13 +498,13 @@ class CircleTracker:
 
     def _at_start(self, track: Track, predicted: Array, found: int, event: str) -> CircleFrame:
         """The frame of an acquisition. No appearance is known yet: the coefficient is that of the rim."""
-        x, P = track.bank.state()
+        x, P = track.state()
         gamma = float(np.clip(1 - track.fit.coverage, 0.0, 1.0))
         return CircleFrame(PoseStatus.MEASURED, Cause.NONE, x, P, predicted, track.fit, gamma, found, event)
 
     def _unmeasured(self, track: Track, cause: Cause, predicted: Array, gamma: float) -> CircleFrame:
         """A frame without a measurement: predicted, or lost."""
-        x, P = track.bank.state()
+        x, P = track.state()
         sigma = float(np.sqrt(max(P[0, 0], P[1, 1])))
         certain = sigma <= self.parameters.lost_sigma_radii * max(float(x[2]), 1.0)
         gamma = gamma if sigma <= _COMPARED_RADII * x[2] else np.nan  # of a place where the target may not be

@@ -85,7 +85,7 @@ class CandidateTracks:
         """Continue with a picture's detections; cov (n, 2, 2), px^2. Returns the steps of a confirmed motion, or None.
 
         dt: frames since the last picture. may_start (n,): detections where a motion may begin. Of several motions that
-        are confirmed, the brightest is chosen, or the one that is nearest to the place `near` (2,).
+        are confirmed, that of the foremost detections is chosen, or the one that is nearest to the place `near` (2,).
         """
         p, kept = self.parameters, min(len(found), self.parameters.most_candidates)
         continued = [c for track in self._tracks if (c := self._continued(track, dt, found, cov)) is not None]
@@ -101,7 +101,7 @@ class CandidateTracks:
         if not confirmed:
             return None
         if near is None:
-            return _brightest(confirmed)
+            return _foremost(confirmed)
         return min(confirmed, key=lambda track: float(np.linalg.norm(track[-1].x[:2] - near)))
 
     def _continued(self, track: tuple[Step, ...], dt: float, found: Detections, cov: Array) -> tuple[Step, ...] | None:
@@ -136,9 +136,9 @@ def _second(first: Step, found: Detections, cov: Array, row: int, dt: float) -> 
     return Step(x, P, row, float(found.flux[row]))
 
 
-def _brightest(tracks: Sequence[tuple[Step, ...]]) -> tuple[Step, ...]:
-    """The motion whose faintest detection is brightest; without brightness the first detections of the table."""
-    return max(tracks, key=lambda t: (min(float(np.nan_to_num(s.flux)) for s in t), -max(s.row for s in t)))
+def _foremost(tracks: Sequence[tuple[Step, ...]]) -> tuple[Step, ...]:
+    """The motion whose last detection in the order of its picture comes first there: the brightest, or sharpest."""
+    return min(tracks, key=lambda t: (max(s.row for s in t), sum(s.row for s in t)))
 
 
 # The tracker of one target: a constant-velocity Kalman filter with gate, prediction through misses, re-acquisition.

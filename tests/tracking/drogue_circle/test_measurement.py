@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from tests.tracking.drogue_circle.discs import BLUR_PX, covered, discs, rounded
+from tests.tracking.drogue_circle.discs import BLUR_PX, covered, discs, rounded, textured
 from tracking.drogue_circle.detectors import (
     CircleCandidate,
     CircleParameters,
@@ -158,6 +158,19 @@ def test_the_covariance_is_that_of_the_errors():
     for hidden in (0.0, 0.2, 0.4):
         assert 0.6 < np.mean(errors.nees_centre[errors.hidden == hidden]) / 2 < 1.7
     assert errors.median("ours") < 0.2 < min(errors.median("opencv"), errors.median("printed"))
+
+
+def test_the_covariance_of_a_textured_disc_is_that_of_its_errors():
+    """Texture moves neighbouring edges alike: over ten pixels of the rim and more, which adds to one side."""
+    rng = np.random.default_rng(32)
+    nees = []
+    for _ in range(100):
+        centre, radius = rng.uniform((78, 58), (82, 62)), rng.uniform(20, 45)
+        fit = fitted(textured(rng, centre, radius, rng.uniform(2, 6)), *centre + 0.4, radius + 0.3, polarity=-1)
+        assert fit is not None
+        away = fit.centre_and_radius[:2] - centre
+        nees.append(away @ np.linalg.solve(fit.covariance_px2[:2, :2], away) / 2)
+    assert 0.75 < np.mean(nees) < 1.35  # the mean of 100: 1 with a sigma of .1
 
 
 @pytest.mark.parametrize("area", [(0, 120, 0, 160), (30, 60, -5, 40)])

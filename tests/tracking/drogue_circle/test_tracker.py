@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from tests.marks import further_slow
-from tests.tracking.drogue_circle.discs import BLUR_PX, BRIGHT, GREY, covered, discs, rounded
+from tests.tracking.drogue_circle.discs import BLUR_PX, BRIGHT, GREY, covered, discs, rounded, textured
 from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, Window, classical_detector
 from tracking.drogue_circle.printed import PrintedTracker
 from tracking.drogue_circle.rim_fit import SECTORS, Rim, RimFit, fit_rim, smooth_crop
@@ -34,6 +34,20 @@ def test_edges_next_to_gaps_may_be_off_by_the_corner_there_and_no_more(rms_px, b
     rim = Rim(50.0, 50.0, 10.6)  # .24 px is allowed for the others; circles of trees and clouds have .36 px and more
     fit = RimFit(rim, np.eye(3), 0.88, rms_px, beside_gaps, 1, 0.7, np.ones(SECTORS))
     assert is_certain(fit) is certain
+
+
+def test_the_mean_of_pictures_reduces_the_error_by_noise_and_not_that_by_texture():
+    """At rest, texture moves the rim of every picture alike."""
+    rng = np.random.default_rng(4)
+    circle = (80.3, 60.6, 30.0)
+    shares = []
+    for light in (discs([circle], noise=0.0), textured(rng, circle[:2], circle[2], 4.0)):
+        tracker = new_tracker()
+        for _ in range(30):
+            frame = tracker.step(rounded(light + rng.normal(0, 1.5, light.shape)))
+        stated, fitted = frame.covariance, frame.measured.covariance_px2
+        shares.append(np.sqrt(np.trace(stated[:2, :2]) / np.trace(fitted[:2, :2])))
+    assert shares[0] < 0.9 < 0.93 < shares[1] <= 1.0
 
 
 def test_a_moving_disc_is_followed_with_its_rates():

@@ -63,6 +63,17 @@ def test_the_stronger_blob_comes_first():
     np.testing.assert_allclose(found.uv_px, [(150, 90), (60, 80)], atol=0.2)
 
 
+@pytest.mark.parametrize("ink", [40.0, 230.0])
+def test_a_disc_comes_before_a_part_of_a_cloud_with_a_larger_sum_of_contrasts(ink):
+    v, u = np.mgrid[:180, :240]
+    cloud = np.sign(ink - 140) * 70 * np.exp(-(np.hypot(u - 60, v - 80) ** 2) / (2 * 9.0**2))
+    picture = disc((150.3, 90.2), 5.0, ground=140 + cloud, ink=ink)
+    found = find_blobs(picture, BlobParameters(polarity="darker" if ink < 140 else "brighter"))
+    assert len(found) == 2
+    assert found.flux[1] > 1.5 * found.flux[0]
+    np.testing.assert_allclose(found.uv_px[0], (150.3, 90.2), atol=0.1)
+
+
 @pytest.mark.parametrize(("radius", "noise"), [(4.0, 1.5), (9.0, 1.5), (9.0, 5.0)])
 def test_the_stated_sigma_is_that_of_the_errors_at_all_places_between_the_pixels(radius, noise):
     centres = np.array([100.0, 80.0]) + np.random.default_rng(3).uniform(-0.5, 0.5, (40, 2))

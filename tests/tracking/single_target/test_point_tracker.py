@@ -140,6 +140,13 @@ def test_the_start_place_chooses_among_several_targets():
     assert set(statuses(nowhere)) == {"lost"}
 
 
+def test_of_two_motions_that_of_the_foremost_detections_is_followed():
+    rng = np.random.default_rng(10)
+    one, other = motion(rng, 30), motion(rng, 30, start=(600.0, 500.0))
+    found = [at(a, b, flux=[1000.0, 2000.0]) for a, b in zip(one, other, strict=True)]  # a detector's own order
+    assert track_point(steps(30), found, FIXED)[-1].row == 0
+
+
 @pytest.mark.parametrize("true", [0.02, 2.0])
 def test_the_process_noise_is_estimated(true):
     rng = np.random.default_rng(9)
