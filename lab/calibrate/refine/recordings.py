@@ -83,8 +83,14 @@ class LabelledRun:
 
     run: Run
     recording: ModelCheckRecording  # of the run's own cameras; long recordings are thinned
+    pictures: SampledFrames
     unlabelled: tuple[str, ...] = ()  # cameras whose points may be spots, and of which none has a label
     searched: bool = False  # whether mistakes of the set-up have been searched for, and none was found
+
+    def refuse_mistakes(self) -> None:
+        """Raises CalibrationError: the pictures show a mistake in the set-up."""
+        if not self.searched:
+            _refuse(self.run, _searched(self.run, self.pictures)[0])
 
     def in_views_of(self, rig: Rig) -> ModelCheckRecording:
         """The recording with the views of a rig that has further cameras."""
@@ -248,15 +254,18 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, search: bool
     if search and (few or wrong or doubtful):
         more, searched = _searched(run, pictures)
         found = (*found, *more)
-    found = (*found, *(unused_finding(n, cameras[n].points, cameras[n].pictures) for n in wrong))
-    if found:
-        raise CalibrationError(f"{run.folder}: {found[0].what}. {found[0].remedy}")
+    _refuse(run, (*found, *(unused_finding(n, cameras[n].points, cameras[n].pictures) for n in wrong)))
     if passes.clocks is not None:
         model, estimated = SpotModel.of(run.rig), passes.pipeline.run
         clock_s = _clocks_of(run.rig) + (_clocks_in_use(estimated) - _clocks_in_use(run))
         velocity = np.nan_to_num(pixel_velocities(model, recording, np.arange(len(recording.seen))))
         recording = replace(recording, velocity_px_s=velocity, clock_s=clock_s[model.camera_of])
-    return LabelledRun(run, recording, tuple(unused), searched)
+    return LabelledRun(run, recording, pictures, tuple(unused), searched)
+
+
+def _refuse(run: Run, found: Sequence[Finding]) -> None:
+    if found:
+        raise CalibrationError(f"{run.folder}: {found[0].what}. {found[0].remedy}")
 
 
 def _searched(run: Run, pictures: SampledFrames) -> tuple[tuple[Finding, ...], bool]:
