@@ -35,6 +35,7 @@ from lab.calibrate.refine.recordings import (
     free_group,
     hidden_mistakes,
     labelled,
+    refuse_mistakes,
     stated_covariance,
     tolerant,
     with_rig,
@@ -139,8 +140,8 @@ def _solve(
     refined, findings = result.refined, refine_findings(result)
     failed = verdict(findings) is Level.FAIL
     if failed and not refined.moved:
-        for r in result.runs:
-            r.refuse_mistakes()
+        for given, used in zip(runs, result.runs, strict=True):
+            refuse_mistakes(used, given)
     inputs = [rig_path, *(r.path for r in runs)]
 
     def write(folder: Path) -> None:
@@ -185,7 +186,7 @@ def _refined(
         nonlocal search
         if progress is not None:
             progress(stage * len(runs) + i, len(stages) * len(runs), run.name)
-        found = labelled(run, *stages[stage], search=search)
+        found = labelled(run, *stages[stage], given=runs[i] if search else None)
         search &= not found.searched  # all mistakes take 15 s: once
         return found
 
@@ -209,8 +210,8 @@ def _refined(
         recordings = [with_place_errors(r.in_views_of(rig), model) for r in second]
         refined = refine(rig, prior, recordings, start, stacks)
     except AdjustmentError as error:
-        for run in latest.values():
-            run.refuse_mistakes()
+        for i, one in latest.items():
+            refuse_mistakes(one, runs[i])
         raise CalibrationError(f"the rig cannot be refined by these recordings: {error}") from None
     checks = tuple(r.check(refined.rig, refined.covariance) for r in second)
     hidden = hidden_mistakes(rig, prior, second, stacks)
