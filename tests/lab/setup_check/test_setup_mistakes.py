@@ -171,7 +171,7 @@ def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(recording, tmp
 
 
 @pytest.mark.parametrize("turn", [np.diag([-1.0, 1.0]), np.diag([1.0, -1.0]), -np.eye(2), np.eye(2)[::-1]])
-def test_pictures_of_all_cameras_turned_or_mirrored_alike_are_told_apart(recording, turn):
+def test_pictures_of_all_cameras_turned_or_mirrored_alike_are_distinguished(recording, turn):
     run, frames = load_run(recording), SampledFrames()
     for number, found in Pipeline.of(run).detections():
         named = dict(zip(run.rig.cameras, found, strict=True))
