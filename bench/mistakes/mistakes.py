@@ -100,9 +100,12 @@ def _cropped(left: float, top: float) -> Callable[[np.ndarray, tuple[int, int]],
     return change
 
 
-def _all_half(f: Files) -> None:
-    for name in f.cameras:
-        f.pixels(name, _scaled(0.5))
+def _in_all(change: Callable[[np.ndarray, tuple[int, int]], np.ndarray]) -> Callable[[Files], None]:
+    def make(f: Files) -> None:
+        for name in f.cameras:
+            f.pixels(name, change)
+
+    return make
 
 
 def _numbered_later(which: int) -> Callable[[Files], None]:
@@ -224,12 +227,17 @@ CASES = (
     Case("two cameras' names exchanged", "exchanged", _exchange_cameras),
     Case("mirrored left-right", "mirrored left to right", _picture(lambda uv, s: [s[0] - 1, 0] + uv * [-1, 1])),
     Case("mirrored up-down", "mirrored upside down", _picture(lambda uv, s: [0, s[1] - 1] + uv * [1, -1], 1)),
+    Case(
+        "mirrored left-right, all cameras",
+        "all cameras are mirrored left",
+        _in_all(lambda uv, s: [s[0] - 1, 0] + uv * [-1, 1]),
+    ),
     Case("turned by 180 deg", "turned by 180", _picture(lambda uv, s: [s[0] - 1, s[1] - 1] - uv)),
     Case("turned by 90 deg", "turned by 90", _picture(lambda uv, s: [s[1] - 1, 0] + uv[:, ::-1] * [-1, 1], 1)),
     Case("turned by -90 deg", "turned by 90", _picture(lambda uv, s: [0, s[0] - 1] + uv[:, ::-1] * [1, -1])),
     Case("transposed", "transposed", _picture(lambda uv, s: uv[:, ::-1])),
     Case("half resolution, one camera", "half the resolution", _picture(_scaled(0.5), 1)),
-    Case("half resolution, all cameras", "half the resolution", _all_half),
+    Case("half resolution, all cameras", "half the resolution", _in_all(_scaled(0.5))),
     Case("cropped to the middle half", "cropped", _picture(_cropped(0.25, 0.25))),
     Case("cropped elsewhere", "cropped", _picture(_cropped(0.3, 0.15), 1)),
     Case("numbered from 1, one camera", "numbers one too|numbered (wrongly|from)", _numbered_later(0)),

@@ -176,19 +176,17 @@ def _pictures(rig: Rig) -> Iterator[Mistake]:
             rig,
             {a: PictureChange(b), b: PictureChange(a)},
         )
-    for name, camera in rig.cameras.items():
-        width, height = camera.image_size_px
+    for of, names in _each_and_all(rig.cameras):
         for rows, words, remedy in _TURNS:
-            turn = np.array(rows, dtype=float)
-            # A coordinate that runs backwards ends at the last pixel of the picture that the rig describes.
-            shift = np.where(turn.sum(axis=1) < 0, [width - 1.0, height - 1.0], 0.0)
             yield Mistake(
                 "turned",
-                f"the pictures of camera `{name}` are {words}",
+                f"the pictures of {of} are {words}",
                 f"{remedy}; camera.yaml and the run need the same orientation",
                 rig,
-                {name: PictureChange(name, turn, shift)},
+                {n: _turned(rig.cameras[n], np.array(rows, dtype=float)) for n in names},
             )
+    for name, camera in rig.cameras.items():
+        width, height = camera.image_size_px
         quarter = np.array([width, height]) // 4
         yield Mistake(
             "size",
@@ -216,6 +214,11 @@ def _pictures(rig: Rig) -> Iterator[Mistake]:
                 rig,
                 {n: PictureChange(n, scale * np.eye(2), shift) for n in names},
             )
+
+
+def _turned(camera: Camera, turn: Array) -> PictureChange:
+    # A coordinate that runs backwards ends at the last pixel of the picture that the rig describes.
+    return PictureChange(camera.name, turn, np.where(turn.sum(axis=1) < 0, np.array(camera.image_size_px) - 1.0, 0.0))
 
 
 def _camera_poses(rig: Rig) -> Iterator[Mistake]:

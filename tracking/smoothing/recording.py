@@ -75,6 +75,11 @@ class EstimatedClocks:
     mean_s: Array  # (p,) of the prior
     sigma_s: Array  # (p,)
 
+    def largest_offset_s(self, sigma_s: Array) -> float:
+        """The largest of the sigmas (p,) that are of offsets; 0 without."""
+        own = zip(sigma_s.tolist(), self.numbers, strict=True)
+        return max((sigma for sigma, (_, is_row_time) in own if not is_row_time), default=0.0)
+
     def offset_sigma_s(self, covariance: Array) -> float:
         """Of the sum of all offsets with this covariance (p, p) of the numbers."""
         return float(np.sqrt(sum(covariance[i, i] for i, (_, row_time) in enumerate(self.numbers) if not row_time)))
@@ -192,15 +197,18 @@ class TrackedRecording:
         """(m,): of the variance of a coordinate of each detection of the run, the part that belongs to its place."""
         return self._place.values
 
-    def unknown_clocks(self, corrections_s: Array, unsettled: bool) -> UnknownClocks | None:
-        """The clocks that are estimated with the motion, after these corrections (p,). unsettled: all keep priors."""
+    def unknown_clocks(self, corrections_s: Array, unsettled: bool, far_s: float) -> UnknownClocks | None:
+        """The clocks that are estimated with the motion, after these corrections (p,). unsettled: all keep priors.
+
+        far_s: a sigma of the present offsets.
+        """
         clocks, model = self.clocks, self.model
         if clocks is None:
             return None
         camera, is_row_time = zip(*clocks.numbers, strict=True)
         return UnknownClocks(
             np.array(camera, dtype=np.int64), np.array(is_row_time, dtype=bool), clocks.mean_s - corrections_s,
-            clocks.sigma_s, model.camera_of, (model.image_size_px[:, 1] - 1) / 2, unsettled, self.calibration,
+            clocks.sigma_s, model.camera_of, (model.image_size_px[:, 1] - 1) / 2, unsettled, far_s, self.calibration,
         )  # fmt: skip
 
     def delays(self, corrections_s: Array | None = None) -> Delays | None:

@@ -31,7 +31,7 @@ from tracking.smoothing.labels.continuity import continued, transfers_between_ca
 from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, labelled_once, next_to
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
-from tracking.smoothing.motion.clocks import MAX_CLOCK_STEPS, clock_sigmas, clock_step
+from tracking.smoothing.motion.clocks import NARROWER, TURN_SIGMAS, clock_sigmas, clock_step
 from tracking.smoothing.motion.process_noise import corner_offsets, jump_sigmas
 from tracking.smoothing.motion.run_detections import (
     Reference,
@@ -108,6 +108,8 @@ class _Smoother:
         self.delays = rec.delays()
         self.correction_s = np.zeros(0 if rec.clocks is None else len(rec.clocks.numbers))
         self.unsettled = False  # the steps of the clocks do not end
+        # A sigma of the clocks' present offsets, with which turns are found.
+        self.far_s = 0.0 if rec.clocks is None else rec.clocks.largest_offset_s(rec.clocks.sigma_s)
         # (T,) frames with pictures of other instants: beside a velocity jump they have no pose of their own.
         self.timed = np.zeros(len(rec), dtype=bool)
         if self.delays is not None:
@@ -166,35 +168,40 @@ class _Smoother:
         return seen._replace(uv=uv, cov=cov)
 
     def estimate(self, max_distance: int) -> None:
-        """Estimate the motion given the labels."""
-        rec = self.rec
-        # A long run's memory is largest here.
-        self.motion, self.own = self.motion.without_covariances(), SingleFramePoses.unknown(0)
-        run = WholeRun(
-            self.views, self.seen, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk,
-            self.delays, rec.unknown_clocks(self.correction_s, self.unsettled),
-        )  # fmt: skip
-        estimated = estimate if self.delays is None else estimate_timed
-        self.motion = estimated(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
-        for step in range(MAX_CLOCK_STEPS + 1):
-            found = self.motion.clocks
-            if found is None or rec.clocks is None:
-                break
-            change = clock_step(found, rec.clocks.sigma_s, step)
+        """Estimate the motion given the labels, and the clocks that are not known."""
+        self.own, clocks, step = SingleFramePoses.unknown(0), self.rec.clocks, 0
+        self._estimate_motion(max_distance)
+        while clocks is not None and (found := self.motion.clocks) is not None:
+            change = clock_step(found, clocks.sigma_s, step)
+            step += 1
             if change is None:
-                self.unsettled, change = True, rec.clocks.mean_s - self.correction_s
-            if not change.any():
-                break
+                self.unsettled, change = True, clocks.mean_s - self.correction_s
+                self.far_s = clocks.largest_offset_s(clocks.sigma_s)
+            elif not change.any():
+                before, after_s = self.far_s, TURN_SIGMAS * np.sqrt(np.diagonal(found.noise))
+                self.far_s, step = min(clocks.largest_offset_s(after_s), before), 0
+                if not self.motion.turns or self.far_s >= NARROWER * before:
+                    break
             self.correction_s = self.correction_s + change
-            self.delays = rec.delays(self.correction_s)
-            run = replace(run, delays=self.delays, clocks=rec.unknown_clocks(self.correction_s, self.unsettled))
-            self.motion = estimated(
-                run, self.assigned, self.measured, self.motion.without_covariances(), max_distance, self.trusted
-            )
+            self.delays = self.rec.delays(self.correction_s)
+            self._estimate_motion(max_distance)
         self.detections = self._at_frames(self.seen, self.motion)
         own = self._single_frame_poses(self.assigned)
         self.measured = own.measured & ~self.conflicting
         self.own = replace(own, measured=self.measured)
+
+    def _estimate_motion(self, max_distance: int) -> None:
+        """Estimate the motion given the labels and the clocks."""
+        rec = self.rec
+        unknown = rec.unknown_clocks(self.correction_s, self.unsettled, self.far_s)
+        run = WholeRun(
+            self.views, self.seen, self.calibration_cov, rec.dt_s, rec.exposure_s, self.parameters.learn_jerk,
+            self.delays, unknown,
+        )  # fmt: skip
+        estimated = estimate if self.delays is None else estimate_timed
+        # A long run's memory is largest here.
+        self.motion = self.motion.without_covariances()
+        self.motion = estimated(run, self.assigned, self.measured, self.motion, max_distance, self.trusted)
 
     def _single_frame_poses(self, assigned: Ints) -> SingleFramePoses:
         motion, rec = self.motion, self.rec

@@ -83,6 +83,7 @@ class LabelledRun:
 
     run: Run
     recording: ModelCheckRecording  # of the run's own cameras; long recordings are thinned
+    pictures: SampledFrames
     unlabelled: tuple[str, ...] = ()  # cameras whose points may be spots, and of which none has a label
     searched: bool = False  # whether mistakes of the set-up have been searched for, and none was found
 
@@ -211,10 +212,11 @@ class _SpotsInReach:
         return self.expected[name] > 0 and self.near[name] >= _IN_REACH * self.expected[name]
 
 
-def labelled(run: Run, most: int | None = None, enough: int = 0, *, search: bool = True) -> LabelledRun:
+def labelled(run: Run, most: int | None = None, enough: int = 0, *, given: Run | None = None) -> LabelledRun:
     """Track and smooth a run with its rig. most: number of frames after which it ends, or after `enough` with poses.
 
-    search: whether mistakes of the set-up are searched for where few frames have a pose or a camera has few labels.
+    given: with the rig as given, for which mistakes of the set-up are searched for where few frames have a pose or a
+    camera has few labels; None: they are not.
     Raises CalibrationError: the recording shows a mistake in the set-up, such as exchanged cameras, which no refinement
     may absorb, or a camera without a spot where its stated errors allow it, or there is no frame at all.
     """
@@ -245,18 +247,27 @@ def labelled(run: Run, most: int | None = None, enough: int = 0, *, search: bool
     few = statistics.measured <= LEAST_MEASURED * statistics.frames
     doubtful = most is None and has_doubtful_pictures(statistics)
     found, searched = mistakes_by_themselves(run.rig, run.prior), False
-    if search and (few or wrong or doubtful):
-        more, searched = _searched(run, pictures)
+    if given is not None and (few or wrong or doubtful):
+        more, searched = _searched(given, pictures)
         found = (*found, *more)
-    found = (*found, *(unused_finding(n, cameras[n].points, cameras[n].pictures) for n in wrong))
-    if found:
-        raise CalibrationError(f"{run.folder}: {found[0].what}. {found[0].remedy}")
+    _refuse(run, (*found, *(unused_finding(n, cameras[n].points, cameras[n].pictures) for n in wrong)))
     if passes.clocks is not None:
         model, estimated = SpotModel.of(run.rig), passes.pipeline.run
         clock_s = _clocks_of(run.rig) + (_clocks_in_use(estimated) - _clocks_in_use(run))
         velocity = np.nan_to_num(pixel_velocities(model, recording, np.arange(len(recording.seen))))
         recording = replace(recording, velocity_px_s=velocity, clock_s=clock_s[model.camera_of])
-    return LabelledRun(run, recording, tuple(unused), searched)
+    return LabelledRun(run, recording, pictures, tuple(unused), searched)
+
+
+def refuse_mistakes(used: LabelledRun, given: Run) -> None:
+    """Raises CalibrationError: a run shows a mistake in the set-up. given: this run with the rig as given."""
+    if not used.searched:
+        _refuse(given, _searched(given, used.pictures)[0])
+
+
+def _refuse(run: Run, found: Sequence[Finding]) -> None:
+    if found:
+        raise CalibrationError(f"{run.folder}: {found[0].what}. {found[0].remedy}")
 
 
 def _searched(run: Run, pictures: SampledFrames) -> tuple[tuple[Finding, ...], bool]:

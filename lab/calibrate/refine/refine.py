@@ -17,7 +17,6 @@ import numpy as np
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.model_check.fault_identification import FittedFault, SuspectedFault
 from calibration.model_check.faults import BEAM, CAMERA, ZOOMED
-from calibration.model_check.linearised_frames import ModelCheckRecording
 from calibration.rig.recordings import Reduced
 from calibration.rig.refinement import FEWEST_FRAMES, MOTIONS, Refinement, further_motions, refine
 from calibration.terms.rig_blocks import BEAMS, BOWS, CAMERAS, INTRINSICS, OFFSETS, ROW_TIMES, SCREENS, prior_of
@@ -36,6 +35,7 @@ from lab.calibrate.refine.recordings import (
     free_group,
     hidden_mistakes,
     labelled,
+    refuse_mistakes,
     stated_covariance,
     tolerant,
     with_rig,
@@ -139,6 +139,9 @@ def _solve(
     result = _refined(runs, file.rig, prior, stacks, progress)
     refined, findings = result.refined, refine_findings(result)
     failed = verdict(findings) is Level.FAIL
+    if failed and not refined.moved:
+        for given, used in zip(runs, result.runs, strict=True):
+            refuse_mistakes(used, given)
     inputs = [rig_path, *(r.path for r in runs)]
 
     def write(folder: Path) -> None:
@@ -183,18 +186,19 @@ def _refined(
         nonlocal search
         if progress is not None:
             progress(stage * len(runs) + i, len(stages) * len(runs), run.name)
-        found = labelled(run, *stages[stage], search=search)
+        found = labelled(run, *stages[stage], given=runs[i] if search else None)
         search &= not found.searched  # all mistakes take 15 s: once
         return found
 
+    latest: dict[int, LabelledRun] = {}  # of each run
     try:
         now, times = (rig, prior), 1.0
-        latest: dict[int, ModelCheckRecording] = {}  # of each run
         for stage, i in product(range(len(_FIRST_FRAMES)), range(len(runs))):
             # Each run is labelled with what those before it have shown.
-            latest[i] = of_stage(tolerant(with_rig(runs[i], *now), times), i, stage).in_views_of(rig)
+            latest[i] = of_stage(tolerant(with_rig(runs[i], *now), times), i, stage)
             try:
-                start = refine(rig, prior, list(latest.values()), stacks=stacks, for_labels=True)
+                known = [r.in_views_of(rig) for r in latest.values()]
+                start = refine(rig, prior, known, stacks=stacks, for_labels=True)
             except AdjustmentError:
                 if stage > 0 and i == len(runs) - 1:
                     raise
@@ -206,6 +210,8 @@ def _refined(
         recordings = [with_place_errors(r.in_views_of(rig), model) for r in second]
         refined = refine(rig, prior, recordings, start, stacks)
     except AdjustmentError as error:
+        for i, one in latest.items():
+            refuse_mistakes(one, runs[i])
         raise CalibrationError(f"the rig cannot be refined by these recordings: {error}") from None
     checks = tuple(r.check(refined.rig, refined.covariance) for r in second)
     hidden = hidden_mistakes(rig, prior, second, stacks)

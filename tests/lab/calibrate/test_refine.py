@@ -213,7 +213,7 @@ def test_a_camera_whose_points_may_be_its_spots_is_left_out_and_the_recording_us
     drawn, scenes, _ = bench.campaign(seed, 75, clocks_s=sigmas.clocks)
     known = bench.drawn_rig(np.random.default_rng([seed, bench.RIG]), drawn.rig, sigmas)
     write_run_folder(replace(scenes[1], known_rig=known, covariance=bench.rig_covariance(known, sigmas)), tmp_path)
-    found = labelled(load_run(tmp_path), search=False)
+    found = labelled(load_run(tmp_path))
     third = [camera == "third" for camera, _ in known.views()]
     assert (found.unlabelled, found.recording.seen[:, third].any()) == (("third",), False)
     assert np.isfinite(found.recording.poses.translation[:, 0]).sum() > 10

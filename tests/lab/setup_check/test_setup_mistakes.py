@@ -21,6 +21,7 @@ from bench.mistakes.recordings import calibrated
 from bench.random_scenes.scene import random_scene
 from bench.random_scenes.write_folder import write_run_folder
 from geometry.arrays import Array
+from geometry.camera import Camera
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
@@ -29,11 +30,13 @@ from geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from lab.calibrate.camera.photos import _frames
 from lab.files.project.project import Cloud
 from lab.files.rig.rig_file import save_rig
+from lab.files.run.run_file import load_run
 from lab.pictures.source import pictures, video_at
 from lab.runs import setup_check
+from lab.runs.frames.pipeline import Pipeline
 from lab.runs.input_check import check
 from lab.runs.process import process_run
-from lab.runs.setup_check import SampledFrames, frames_of
+from lab.runs.setup_check import SampledFrames, compared_with_mistakes, frames_of
 from lab.simulate.scenarios import fan, unequal_fan
 from lab.simulate.write import simulate
 from tests.lab.run_folders import edit, write_run
@@ -166,6 +169,22 @@ def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(recording, tmp
     assert status == 2
     assert words in text
     assert "(BP-M06)" in text
+
+
+@pytest.mark.parametrize("turn", [np.diag([-1.0, 1.0]), np.diag([1.0, -1.0]), -np.eye(2), np.eye(2)[::-1]])
+def test_pictures_of_all_cameras_turned_or_mirrored_alike_are_distinguished(recording, turn):
+    run, frames = load_run(recording), SampledFrames()
+    for number, found in Pipeline.of(run).detections():
+        named = dict(zip(run.rig.cameras, found, strict=True))
+        frames.add(number, {n: replace(d, uv_px=changed(run.rig.cameras[n], turn, d.uv_px)) for n, d in named.items()})
+    compared = compared_with_mistakes(run, frames.blocks)
+    assert [np.array_equal(c.turn, turn) for m, _ in compared.found for c in m.pictures.values()] == [True, True]
+
+
+def changed(camera: Camera, turn: Array, uv_px: Array) -> Array:
+    """As recorded: about the middle of the picture."""
+    middle = (np.array(camera.image_size_px) - 1) / 2
+    return (uv_px - middle) @ turn + (middle if turn[0, 0] else middle[::-1])
 
 
 @pytest.mark.parametrize("name", [None, "numbered from 1, another camera"])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from bench import refine as bench
+from bench.mistakes.mistakes import read, write
 from calibration.model_check.linearised_frames import ModelCheckRecording
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
@@ -17,6 +18,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.calibrate.refine.refine import refine_rig
+from lab.errors import CalibrationError
 from lab.files.rig.rig_file import RigFile, covariance_blocks, save_rig
 from lab.files.run.run_file import load_run
 from lab.findings.finding import Level
@@ -26,6 +28,7 @@ from lab.simulate.scenarios import four_skew_beams, unequal_fan
 from lab.simulate.write import simulate
 from tracking.parameters import LabelParameters
 
+MIRROR_SIGMAS = bench.Sigmas((3e-3, 1.7e-3), (2e-3, 1e-3), (1e-3, 1e-3), clocks=0.0)
 SIGMAS = bench.Sigmas((3e-3, 2e-3), (2e-3, 1e-3), (1e-3, 1e-3), clocks=0.0)
 EXCHANGED = "the pictures of cameras `left` and `right` are exchanged, or they have each other's place"
 PRIOR = PosePrior(Pose.from_ypr(np.deg2rad([12.0, 5.0, 3.0]), np.array([0.1, 0.05, 0.02])), 0.5, float(np.deg2rad(40)))
@@ -106,3 +109,23 @@ def test_a_run_whose_rig_has_a_covariance_reports_what_it_hides(tmp_path):
     verdict = process_run(exchanged(tmp_path, truth=False), tmp_path / "out").verdict
     assert [f.code for f in verdict.findings] == ["BP-M10"]
     assert EXCHANGED in verdict.texts[0]
+
+
+@pytest.mark.parametrize(
+    ("seed", "names", "words"), [(9121, ["left"], "camera `left`"), (9121, ["left", "right"], "all cameras")]
+)
+def test_mirrored_pictures_are_named_although_other_labels_give_poses(tmp_path, seed, names, words):
+    """Too few of these poses were determined, or none explained the recording: refused without the reason, or a FAIL.
+
+    Pictures of both cameras were twice as large, as far as the search knew.
+    """
+    run = simulate("smooth", tmp_path / "run", seed=seed, frames=60, detections_only=True, clutter=0.0)
+    shutil.rmtree(run / "truth")
+    known = bench.drawn_rig(np.random.default_rng([seed, 7]), load_run(run).rig, MIRROR_SIGMAS)
+    save_rig(RigFile(known, covariance_blocks(bench.rig_covariance(known, MIRROR_SIGMAS))), run / "rig.yaml")
+    files = read(run)
+    for name in names:
+        files.pixels(name, lambda uv, size: [size[0] - 1, 0] + uv * [-1, 1])
+    mirrored = write(files, tmp_path / "mirrored")
+    with pytest.raises(CalibrationError, match=f"the pictures of {words} are mirrored left to right"):
+        refine_rig([mirrored], mirrored / "rig.yaml", tmp_path / "new")

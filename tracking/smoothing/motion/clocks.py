@@ -29,6 +29,9 @@ _NEGLIGIBLE_STEP = 0.05  # of its sigma: a shorter step of a clock is not taken
 # The third of these steps or a later one, and the last, of a number whose sigma is below DETERMINED: longer than so
 # many of its sigmas, or than this share of its prior's. Then nothing is known of any: a linear problem takes one step.
 _FIRST_SMALL, _UNSETTLED_SIGMAS, _UNSETTLED_SHARE = 2, (3.0, 1.0), 0.3
+# Sigmas of offsets, as a sigma of the moments of turns: the same spots show these and then the offsets.
+TURN_SIGMAS = 2.0
+NARROWER = 0.7  # of that sigma: a new one that is less needs a further solution
 _ROUNDING = 30.0  # times the error of the smallest eigenvalue: less is rounding
 _CHUNK = 512  # frames whose rows are in memory at once
 

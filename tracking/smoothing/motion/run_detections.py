@@ -444,6 +444,7 @@ class UnknownClocks:
     camera_of: Ints  # (n,) of the views
     middle_row: Array  # (n,) of the pictures
     unsettled: bool  # no number is solved for
+    far_s: float  # sigma of the present offsets, with which turns have been found
     calibration: RigUncertainty | None = None
 
     def columns(self, speed: Array, row: Array) -> Array:

@@ -235,9 +235,7 @@ class _TimedEstimator(_Estimator):
     def _with_other_clocks(self, turn: Turn) -> Turn:
         """A turn at the moments that it may have with other clocks: those found with the present ones confirm these."""
         assert self.run.clocks is not None
-        own = self.run.clocks
-        sigma = np.max(own.sigma_s[~own.is_row_time], initial=0.0)
-        return turn._replace(length_s=float(np.hypot(turn.length_s, np.sqrt(12) * sigma)))
+        return turn._replace(length_s=float(np.hypot(turn.length_s, np.sqrt(12) * self.run.clocks.far_s)))
 
     def _with_unresolved(self, out: Interval) -> Interval:
         """The covariances, where turns or hidden jumps resemble others, of both motions about that with the former.
