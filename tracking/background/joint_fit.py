@@ -227,13 +227,14 @@ class JointFit:
     strength_cov: Array  # (2, 2): of p and q
     level_dn: float  # DN above black, of the ground
     expected: tuple[float, float]  # share of the light that this modulates, before the fit, and its sigma
+    noise_share: float  # of the structure of the ground: that modulates nothing, and may hide all that the rest does
 
     @property
     def shown(self) -> tuple[float, float]:
         """The share of the light that the ground modulates, and its variance, by the pictures alone."""
         (share, variance), (before, sigma) = self.modulated_share(self.level_dn), self.expected
         left = max(1 - variance / sigma**2, _LEAST_SHOWN)  # of the information
-        return before + (share - before) / left, variance / left
+        return before + (share - before) / left, variance / left + (MODULATED[0] * self.noise_share) ** 2
 
     def modulated_share(self, level_dn: float) -> tuple[float, float]:
         """The share of the light that the surface's brightness modulates, where that is `level_dn`; its variance."""
@@ -341,4 +342,7 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     # The noise of the background, 1 / n, is in its information as well.
     shared = max(every - (1 + 1 / n) * own, 0.0) * max(chi2, 1.0) + (_LEAST_SIGMA * float(widths.max())) ** 2
     strength_cov = covariance[:2, :2] * max(chi2, 1.0)
-    return JointFit(light, float(shared / max(own, 1e-9)), strength_cov, pixels.usual, pixels.modulated)
+    lit = np.sum(seen.light_of**2, axis=0)
+    about = seen.behind - light.plane[0] - (pixels.uv - light.origin) @ light.plane[1:]
+    noise_share = min(float(np.sum(lit / seen.information) / max(np.sum(lit * about**2), 1e-300)), 1.0)
+    return JointFit(light, float(shared / max(own, 1e-9)), strength_cov, pixels.usual, pixels.modulated, noise_share)

@@ -237,3 +237,18 @@ def test_light_modulates_light_and_the_black_level_is_none():
     more = [m.response(np.array([30.0, 33.6])) for m in shown if m is not None]  # a fifth more light
     assert more[-1] == pytest.approx([1.0, 1.2], abs=0.02)
     assert len(more) == 1 or more[0][1] < 1.17
+
+
+def test_ground_whose_structure_is_no_more_than_its_noise_hardly_shows_how_it_modulates_a_light():
+    """The background behind the light is known to its noise only; that modulates nothing."""
+    off = []
+    for seed in range(24):
+        grain = gaussian_filter(np.random.default_rng([seed, 7]).standard_normal(X.shape), 1.0)
+        ground = 50.0 + 0.2 * grain / grain.std()
+        at = places(20.0)
+        fit = fit_of(pictures(at, ground, 0.4, seed), at + OFF)
+        assert fit is not None
+        share, variance = fit.shown
+        modulated = 0.4 * fit.level_dn / 60.0
+        off.append((share - modulated / (0.6 + modulated)) / np.sqrt(variance))
+    assert np.sqrt(np.mean(np.square(off))) < 1.5
