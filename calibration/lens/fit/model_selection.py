@@ -233,6 +233,8 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
         return _Judged(candidate)
     try:
         equations = ViewEquations.of(table, found)
+        spread = equations.scatter()
+        stated = scattered(found, equations, spread)
     except AdjustmentError as error:
         return _Judged(replace(candidate, refused=f"the views do not determine it: {error}"))
     C = equations.solution()[1][: equations.lens, : equations.lens]
@@ -240,8 +242,6 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
     at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
     inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     variance = np.trace(at.covariance_px2(C)[inside], axis1=-2, axis2=-1)
-    spread = equations.scatter()
-    stated = scattered(found, equations, spread)
     return _Judged(
         candidate,
         map=at,
