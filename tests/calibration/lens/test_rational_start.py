@@ -16,7 +16,8 @@ from calibration.lens.intrinsics import calibrate_intrinsics
 from geometry.camera import FISHEYE
 from tests.calibration.lens.lens_scenes import WIDE, Scene, photographs
 
-RATIONAL = (496.1, 496.06, 633.6, 453.0, 1.0338, 0.21955, -3e-4, -1.3e-4, 0.004991, 1.3669, 0.47025, 0.032727)
+RATIONAL = (496.1, 496.06, 633.6, 453.0, 1.03382742, 0.219551451, -3.08894325e-4, -1.26761097e-4, 4.99145126e-3)
+RATIONAL += (1.36690629, 0.470252068, 0.0327271282)
 
 
 def test_every_corner_is_predicted_also_those_that_the_fisheye_rejects():
