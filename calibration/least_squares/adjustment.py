@@ -348,7 +348,7 @@ def solve(
 ) -> Adjusted:
     """The values that minimise the cost of the terms.
 
-    A step that fails is bent by the second derivatives along it, then shortened: valleys of parameters with nearly the
+    A step that fails is bent once by the second derivatives along it, then shortened: valleys of parameters with nearly the
     same effect, as of a rational lens, are curved (geodesic acceleration, Transtrum and Sethna 2012, arXiv 1201.5885).
     The start values must lie within the convergence region of Newton's method. Directions that nothing determines keep
     their start values. Raises AdjustmentError: a residual is not finite at the start, or the steps do not converge;
@@ -381,13 +381,13 @@ def solve(
                 if damping > 1e12:
                     raise AdjustmentError("no step reduces the residuals")
                 delta = damped_step(H, g, damping)
-            else:
-                ends = zip(lines, reached(-_AHEAD * delta)[1], reached(_AHEAD * delta)[1], strict=True)
-                with np.errstate(invalid="ignore"):
-                    second = [(b.residuals + c.residuals - 2 * a.residuals) / _AHEAD**2 for a, b, c in ends]
-                second = [np.where(np.isfinite(r), r, 0.0) for r in second]
-                delta += damped_step(H, _normal_equations(terms, lines, columns, second)[1], damping) / 2
-            bent = not bent
+                continue
+            ends = zip(lines, reached(-_AHEAD * delta)[1], reached(_AHEAD * delta)[1], strict=True)
+            with np.errstate(invalid="ignore"):
+                second = [(b.residuals + c.residuals - 2 * a.residuals) / _AHEAD**2 for a, b, c in ends]
+            second = [np.where(np.isfinite(r), r, 0.0) for r in second]
+            delta += damped_step(H, _normal_equations(terms, lines, columns, second)[1], damping) / 2
+            bent = True
         if new_cost <= cost:
             values, lines, cost = moved, new_lines, new_cost
         if damping == first:  # else a tenth of it has just failed
