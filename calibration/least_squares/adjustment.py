@@ -348,8 +348,8 @@ def solve(
 ) -> Adjusted:
     """The values that minimise the cost of the terms.
 
-    A step that fails is bent once by the second derivatives along it, then shortened: valleys of parameters with nearly the
-    same effect, as of a rational lens, are curved (geodesic acceleration, Transtrum and Sethna 2012, arXiv 1201.5885).
+    A step that fails is bent once by the second derivatives along it, then shortened: valleys of parameters with nearly
+    the same effect, as of a rational lens, are curved (geodesic acceleration, Transtrum, Sethna 2012, arXiv 1201.5885).
     The start values must lie within the convergence region of Newton's method. Directions that nothing determines keep
     their start values. Raises AdjustmentError: a residual is not finite at the start, or the steps do not converge;
     KeyError: `free` names a stack that `values` does not have.
