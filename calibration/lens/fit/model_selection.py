@@ -320,8 +320,10 @@ def inliers_of_rich_models(
     wanted = only is not None and only.coefficients >= RATIONAL.coefficients
     tried = any(model == RATIONAL for model, _ in starts)
     if not tried and (wanted or (only is None and all(leaves))):
-        for values in [as_rational(table, f) for f in fits]:
-            fits += _rich_fit(table, RATIONAL, values, reasons, BRIEF)
+        for found in sorted(fits, key=lambda f: f.sigma_px):
+            fits += _rich_fit(table, RATIONAL, as_rational(table, found), reasons, BRIEF)
+            if fits[-1].model == RATIONAL:
+                break
     if not fits:
         raise AdjustmentError(reasons[-1])
     gate = CORNER_GATE * min(f.sigma_px for f in fits)
