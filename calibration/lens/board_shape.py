@@ -25,12 +25,13 @@ from calibration.lens.fit.coverage import seen_at
 from calibration.lens.fit.lens_adjustment import BRIEF, term_of
 from calibration.lens.fit.lens_fit import LensFit, fit
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, board_as_stated
-from calibration.lens.fit.model_selection import EQUAL, difference_px
+from calibration.lens.fit.model_selection import difference_px
 from calibration.lens.fit.projection_map import projection_map
 from calibration.lens.fit.view_equations import Scatter, ViewEquations, scattered
 from geometry.arrays import Array, Bools
 
 SIGNIFICANT = 1e-3  # p-value below which a deviation from the stated board is significant
+_WORSE = 1.1  # ratio of the sigmas of directions above which displaced points are not solved for
 HALF_SIGNIFICANT = 0.01  # the same in each half of the photographs
 EXPLAINED = 0.01  # p-value of scatter between photographs below which noise does not explain it
 # Views of each point required to solve for all points. Its three unknowns take up 3 of the 16 coordinates of 8 views,
@@ -248,7 +249,7 @@ def _points(
     try:
         freed = fit(table, found.used, found.model, found.values, board, limits=BRIEF)
         left = ViewEquations.of(table, freed, AS_STATED).scatter()
-        worse = _direction_sigma_px(table, freed) > EQUAL * _direction_sigma_px(table, found)
+        worse = _direction_sigma_px(table, freed) > _WORSE * _direction_sigma_px(table, found)
     except AdjustmentError as problem:
         return PointsTest(nothing, p, False, f"significant, but they cannot be solved for: {problem}"), found
     off = np.where((seen > 0)[:, None], _without_similarity(table.board_points, freed.printed), 0.0)

@@ -92,6 +92,23 @@ def test_weak_directions_take_one_step_with_little_damping_and_several_with_the_
     assert counts[1] <= 3 < counts[0]
 
 
+class Valley(Counted):
+    """The valley of Rosenbrock (1960), "An automatic method for finding the greatest or least value", Comp. J. 3."""
+
+    def linearise(self, values: Values) -> Linearised:
+        self.count += 1
+        x, y = values["x"].array[0]
+        J = np.array([[-60 * x, 30.0], [1.0, 0.0]])
+        return Linearised(np.array([[30 * (y - x * x), x - 1]]), [Part("x", np.zeros(1, dtype=int), J[None])])
+
+
+def test_a_narrow_curved_valley_is_followed_in_few_steps():
+    valley = Valley()
+    found = solve({"x": Vectors(np.array([[-1.2, 1.0]]))}, [valley], {"x": True})
+    np.testing.assert_allclose(found.values["x"].array[0], 1, atol=2e-3)  # a step of 1e-3 sigmas ends the iteration
+    assert valley.count < 20  # 74 without the second derivatives
+
+
 @settings(max_examples=30)
 @given(seed=seeds)
 def test_sparse_and_dense_algebra_agree_in_values_and_covariance(seed):

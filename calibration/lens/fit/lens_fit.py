@@ -129,7 +129,9 @@ def robust_fit(
     candidates = ~np.isin(table.view, list(dropped))
     values, _ = with_circle_radius(table, candidates, model, values)
     noise = table.noise[:, None]
-    sigma = _spread((_residuals(table, candidates, model, values) / noise)[candidates])
+    residuals = _residuals(table, candidates, model, values)
+    candidates &= np.isfinite(residuals).all(axis=1)  # others are beyond the angle at which the start's lens folds
+    sigma = _spread((residuals / noise)[candidates])
     for _ in range(2):  # the scale of the loss is from residuals, which the first round reduces
         adjusted = adjust(table, candidates, model, values, board, FitSettings(sigma, Cauchy(), search))
         values = adjusted.values

@@ -13,7 +13,7 @@ import numpy as np
 
 from calibration.least_squares.adjustment import AdjustmentError, Cauchy, Values
 from calibration.lens.fit.corner_table import CornerTable
-from calibration.lens.fit.lens_adjustment import BRIEF, FitSettings, adjust, term_of
+from calibration.lens.fit.lens_adjustment import ROUGH, FitSettings, adjust, term_of
 from calibration.lens.fit.lens_fit import FEWEST_CORNERS
 from calibration.lens.fit.lens_models import LensModel, folds_in_picture, undistorted
 from calibration.lens.fit.lens_parameters import AS_STATED, lens_of, values_of
@@ -110,7 +110,7 @@ def _first_lens(focal: float, image_size_px: tuple[int, int]) -> Array:
 def _solved(table: CornerTable, used: Bools, model: LensModel, values: Values, lens_free: Bools) -> Values:
     """The values after a robust fit of some lens parameters (18,)."""
     sigma = max(_missed(table, used, model.fisheye, values, np.nan), 0.05)
-    return adjust(table, used, model, values, AS_STATED, FitSettings(sigma, Cauchy(), BRIEF), lens_free).values
+    return adjust(table, used, model, values, AS_STATED, FitSettings(sigma, Cauchy(), ROUGH), lens_free).values
 
 
 def _missed(table: CornerTable, used: Bools, fisheye: bool, values: Values, of_others: float = np.inf) -> float:

@@ -5,11 +5,10 @@ What a lens is used for are directions. Their expected squared error has two par
 leave, which grows with the coefficients, and the difference to the other models, weighted with the probability that
 these are right. The chosen model has the smallest sum where corners were seen, after the rotation of the camera that
 fits the whole picture: what a model leaves open beyond the corners turns them. It leaves no part of the picture
-unknown; of models with about the same sum, it is of the more probable kind, perspective or fisheye. The sum is the
-variance of Bayesian model averaging (Hoeting et al. 1999, Statistical Science 14) about one of the models, with
-probabilities from the density that each photograph has as predicted by the others (Yao et al. 2018, Bayesian Analysis
-13, pseudo averaging), with their noise raised by the scatter between photographs. Its use as a criterion is ours, after
-the focused information criterion (Claeskens and Hjort 2003, JASA 98).
+unknown. The sum is the variance of Bayesian model averaging (Hoeting et al. 1999, Statistical Science 14) about one of
+the models, with probabilities from the density that each photograph has as predicted by the others (Yao et al. 2018,
+Bayesian Analysis 13, pseudo averaging), with their noise raised by the scatter between photographs. Its use as a
+criterion is ours, after the focused information criterion (Claeskens and Hjort 2003, JASA 98).
 """
 
 from __future__ import annotations
@@ -37,8 +36,7 @@ FEWEST_INLIERS = 0.99  # share of used corners below which a lens model is consi
 UNKNOWN_PX = 3.0  # sigma of the directions in 90 % of the picture from which on a model leaves them unknown
 _COMMON = 0.9  # share of the covered picture over which errors are averaged: at its rim single places may diverge
 OVERFIT = 3.0  # error in held-out photographs over the noise from which on a model depends on single photographs
-EQUAL = 1.1  # ratio of expected errors up to which the model with fewer coefficients is chosen ...
-PLAUSIBLE = 0.01  # ... if its probability is not smaller
+PLAUSIBLE = 0.01  # probability of a model below which it is reported only where no other is more probable
 PLAUSIBLE_NOISE = 0.05  # p-value of mean residuals above which models of 8 and 12 coefficients are not tried
 SIGNIFICANT = 1e-3  # p-value of the mean residuals below which the lens model is wrong
 _CORNERS_PER_CELL = 12
@@ -141,11 +139,10 @@ def _best_start(
 
 
 def _choose(judged: Sequence[_Judged]) -> ModelSelection:
-    """The candidate with about the smallest expected error that leaves no directions unknown.
+    """The candidate with the smallest expected error of those that leave no directions unknown.
 
-    Of several with about the same error: of the more probable kind of lens, perspective or fisheye, the first. If all
-    leave directions unknown, the one with the smallest error where corners were seen is chosen: findings report it.
-    Raises AdjustmentError: no candidate can be used.
+    If all do, the one with the smallest error where corners were seen is chosen: findings report it. Raises
+    AdjustmentError: no candidate can be used.
     """
     solved = [j for j in judged if j.map is not None]
     if not solved:
@@ -170,12 +167,7 @@ def _choose(judged: Sequence[_Judged]) -> ModelSelection:
     out = [done.get(j.candidate.model, j.candidate) for j in judged]
     usable = [c for c in out if c.fit is not None and not c.refused]
     if usable:
-        least = min(usable, key=lambda c: c.error_px)
-        equal = [
-            c for c in usable if c is least or (c.error_px <= EQUAL * least.error_px and c.probability >= PLAUSIBLE)
-        ]
-        fisheye = max(equal, key=lambda c: c.probability).model.fisheye
-        chosen = next(c for c in equal if c.model.fisheye == fisheye)
+        chosen = min(usable, key=lambda c: c.error_px)
         why = f"its directions have the smallest expected error where corners were seen ({chosen.error_px:.2g} px)"
     else:
         folding = {j.candidate.model for j in solved if j.folds}
@@ -233,6 +225,8 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
         return _Judged(candidate)
     try:
         equations = ViewEquations.of(table, found)
+        spread = equations.scatter()
+        stated = scattered(found, equations, spread)
     except AdjustmentError as error:
         return _Judged(replace(candidate, refused=f"the views do not determine it: {error}"))
     C = equations.solution()[1][: equations.lens, : equations.lens]
@@ -240,8 +234,6 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
     at = projection_map(found.model, found.lens, table.image_size_px, 1.0)
     inside = seen_at(table, found.used, at.pixels) & np.isfinite(at.by_parameter).all(axis=(2, 3))
     variance = np.trace(at.covariance_px2(C)[inside], axis1=-2, axis2=-1)
-    spread = equations.scatter()
-    stated = scattered(found, equations, spread)
     return _Judged(
         candidate,
         map=at,
@@ -328,8 +320,10 @@ def inliers_of_rich_models(
     wanted = only is not None and only.coefficients >= RATIONAL.coefficients
     tried = any(model == RATIONAL for model, _ in starts)
     if not tried and (wanted or (only is None and all(leaves))):
-        for values in [as_rational(table, f) for f in fits]:
-            fits += _rich_fit(table, RATIONAL, values, reasons, BRIEF)
+        for found in sorted(fits, key=lambda f: f.sigma_px):
+            fits += _rich_fit(table, RATIONAL, as_rational(table, found), reasons, BRIEF)
+            if fits[-1].model == RATIONAL:
+                break
     if not fits:
         raise AdjustmentError(reasons[-1])
     gate = CORNER_GATE * min(f.sigma_px for f in fits)

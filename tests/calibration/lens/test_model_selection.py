@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.fit import model_selection
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.fit.lens_start import start
@@ -59,3 +60,17 @@ def test_a_rational_lens_that_is_a_start_is_not_derived_again(bent, monkeypatch)
     monkeypatch.setattr(model_selection, "as_rational", lambda *_: pytest.fail("derived again"))
     again = inliers_of_rich_models(bent, [(f.model, f.values) for f in fits])[1]
     assert sorted(f.model.coefficients for f in again) == sorted(f.model.coefficients for f in fits)
+
+
+def test_a_model_without_a_covariance_is_refused_and_does_not_end_the_calibration(monkeypatch):
+    stated = model_selection.scattered
+
+    def open_without_coefficients(found, *rest):
+        if found.model == LensModel(0):
+            raise AdjustmentError("one direction is open")
+        return stated(found, *rest)
+
+    monkeypatch.setattr(model_selection, "scattered", open_without_coefficients)
+    found = calibrate_intrinsics(photographs(Scene(views=6), 1))
+    assert "one direction is open" in found.selection.candidates[0].refused
+    assert found.model != LensModel(0)
