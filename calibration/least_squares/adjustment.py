@@ -357,11 +357,9 @@ def solve(
     columns = _Columns.of_free(values, free, basis or {})
 
     def reached(delta: Array) -> tuple[Values, list[Linearised], float]:
-        """The values after a step, their residuals and their cost."""
         moved = columns.moved(values, delta)
         lines = [t.linearise(moved) for t in terms]
-        finite = all(np.isfinite(line.residuals).all() for line in lines)
-        return moved, lines, _cost(terms, lines) if finite else np.inf
+        return moved, lines, _cost(terms, lines)
 
     values, lines, cost = reached(np.zeros(columns.count))
     if not np.isfinite(cost):
@@ -383,9 +381,7 @@ def solve(
                 delta = damped_step(H, g, damping)
                 continue
             ends = zip(lines, reached(-_AHEAD * delta)[1], reached(_AHEAD * delta)[1], strict=True)
-            with np.errstate(invalid="ignore"):
-                second = [(b.residuals + c.residuals - 2 * a.residuals) / _AHEAD**2 for a, b, c in ends]
-            second = [np.where(np.isfinite(r), r, 0.0) for r in second]
+            second = [_second_difference(*(line.residuals for line in three)) / _AHEAD**2 for three in ends]
             delta += damped_step(H, _normal_equations(terms, lines, columns, second)[1], damping) / 2
             bent = True
         if new_cost <= cost:
@@ -455,8 +451,14 @@ def _weights(term: Term, line: Linearised) -> Array:
     return term.loss.weight(np.sum(line.residuals**2, axis=1))
 
 
+def _second_difference(here: Array, before: Array, after: Array) -> Array:
+    """Of residuals (m,); 0 where one is not finite, or where the values decide how many there are."""
+    as_many = here.shape == before.shape == after.shape
+    return np.nan_to_num(before + after - 2 * here, posinf=0.0, neginf=0.0) if as_many else np.zeros_like(here)
+
+
 def _cost(terms: Sequence[Term], lines: Sequence[Linearised]) -> float:
-    total = 0.0
+    total = 0.0 if all(np.isfinite(line.residuals).all() for line in lines) else np.inf
     for term, line in zip(terms, lines, strict=True):
         s = np.sum(line.residuals**2, axis=1)
         total += float(np.sum(s if term.loss is None else term.loss.cost(s)))

@@ -33,6 +33,7 @@ from lab.files.run.run_file import load_run
 from lab.pictures.picture_file import MissingPicture
 from lab.runs.frames.frames import open_frames
 from lab.runs.process import process_run
+from tests.marks import further_slow
 from tracking.noise import NoiseModel
 
 SMALL = ((320, 256),)
@@ -61,7 +62,7 @@ def test_a_written_recording_is_a_run_folder_that_states_no_noise(tmp_path: Path
                 assert np.abs(off).max() == 0 if file_format == "png" else np.sqrt(np.mean(off**2)) < 4
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", further_slow(FAMILIES, fast=5))
 def test_each_family_gives_a_scene_with_spots_to_ask_for(family):
     renderer = Renderer(picture_scene(7, family, 12, SMALL))
     scene = renderer.ps.scene

@@ -28,6 +28,7 @@ from lab.files.run.run_file import load_run
 from lab.files.run.truth import load_run_truth
 from lab.pictures.picture_file import MissingPicture
 from lab.runs.frames.frames import open_frames
+from tests.marks import further_slow
 from tracking.detections import Detections
 
 FRAMES = 40
@@ -262,7 +263,7 @@ def test_in_memory_and_through_files_are_the_same_program(tmp_path: Path):
     np.testing.assert_allclose(memory.smoothed.poses.translation, files.smoothed.poses.translation, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", further_slow(FAMILIES, fast=5))
 def test_each_family_makes_scenes(name):
     scene = family_scene(name, 3)
     assert len(scene) == FAMILIES[name].frames

@@ -24,6 +24,7 @@ from geometry.camera import FISHEYE, PERSPECTIVE, Camera, pinhole_numbers
 from geometry.lens import padded
 from geometry.pose import Pose
 from lab.simulate.board_photo import BoardPhoto, PhotoSettings, photograph
+from tests.marks import further_slow
 from tests.paths import DATA
 
 px = 1.0
@@ -222,7 +223,7 @@ def test_a_blob_between_circles_is_not_taken_for_one_of_them(across_px, seed):
     assert off.max() < 0.2 * px
 
 
-@pytest.mark.parametrize(("lens", "around"), [(PERSPECTIVE, 0.0), (PERSPECTIVE, 2.356), (FISHEYE, 1.571)])
+@pytest.mark.parametrize(("lens", "around"), further_slow([(PERSPECTIVE, 2.356), (PERSPECTIVE, 0.0), (FISHEYE, 1.571)]))
 def test_oblique_circles_are_not_confused_with_their_neighbours(lens, around):
     """Which are nearer along the short axis than a circle's long one reaches: outlines were off by up to 2.7 px."""
     seen, board = replace(camera(lens), image_size_px=(1280, 960)), parse("acircles:4x11:24mm")
@@ -527,6 +528,7 @@ def test_a_corner_of_a_board_close_to_a_fisheye_lens_is_not_moved_to_where_a_qua
     assert np.max(np.linalg.norm(found - grid, axis=-1)) < 0.5  # 35 px if it is moved; its edges are strongly curved
 
 
+@pytest.mark.slow
 def test_the_slow_search_of_a_whole_picture_is_left_out_where_a_copy_shows_the_board(monkeypatch):
     """The classical detector finds nothing of this board of a fisheye lens: 1.4 s in 1280x960, .06 s in half of it."""
     photos: list[np.ndarray] = []

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from calibration.lens.fit import lens_fit
 from calibration.lens.intrinsics import IntrinsicsOptions, calibrate_intrinsics
@@ -50,6 +51,7 @@ def of_noise_at_the_rim(seed: int, elsewhere_px: float = 0.0):
     return replace(table, pixels=table.pixels + drawn, sigmas_px=sigmas)
 
 
+@pytest.mark.slow
 def test_corners_with_the_noise_of_their_picture_count_by_it():
     squares, smaller = [], []
     for seed in range(4):

@@ -31,6 +31,7 @@ from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance,
 from lab.files.run.run_file import load_run
 from lab.findings.finding import Level
 from lab.simulate.write import simulate
+from tests.marks import further_slow
 from tracking.setup_mistakes import evidence
 
 SIGMAS = {
@@ -171,11 +172,13 @@ def test_only_the_named_groups_change_and_the_others_stay_uncertain(lab, cameras
 
 @pytest.mark.parametrize(
     ("part", "change"),
-    [
-        ("cameras.left-b", {"rot_x_rad": 0.01, "rot_y_rad": -0.01}),
-        ("screens.right", {"z_m": 0.03, "rot_x_rad": 0.01}),
-        ("screens.right", {"z_m": 0.006, "rot_y_rad": 0.002}),  # 3 sigmas: errors of all parts explain it as well
-    ],
+    further_slow(
+        [
+            ("screens.right", {"z_m": 0.006, "rot_y_rad": 0.002}),  # 3 sigmas: errors of all parts explain it as well
+            ("cameras.left-b", {"rot_x_rad": 0.01, "rot_y_rad": -0.01}),
+            ("screens.right", {"z_m": 0.03, "rot_x_rad": 0.01}),
+        ]
+    ),
 )
 def test_a_part_that_moved_by_more_than_stated_is_named_and_an_earlier_rig_stays(lab, short, tmp_path, part, change):
     folder, _, true, _ = lab
@@ -445,6 +448,7 @@ def test_what_is_held_is_named_where_it_explains_the_residuals_that_the_freed_nu
     assert "Leave out --free" in (tmp_path / "new" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_run_with_the_refined_rig_has_its_clocks_and_states_their_sigmas(late, tmp_path):
     folder, run = late
     errors = {}

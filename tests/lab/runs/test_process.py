@@ -417,7 +417,7 @@ def test_a_wrong_smoothed_pose_is_reported_as_predicted_with_sigmas_that_cover_t
     assert np.all(nees[20:30] < 25)
 
 
-@pytest.mark.parametrize("in_memory", [smoothing_pass.IN_MEMORY, 5, 0])
+@pytest.mark.parametrize("in_memory", further_slow([5, 0, smoothing_pass.IN_MEMORY]))
 def test_the_same_run_gives_the_same_tables(tmp_path, run_folder, results, monkeypatch, in_memory):
     """Also if most frames are stored on disk between the passes."""
     monkeypatch.setattr(smoothing_pass, "IN_MEMORY", in_memory)

@@ -199,7 +199,7 @@ def test_wrong_numbers_show_although_a_turntable_moves_in_few_frames_only(record
     assert (status, "numbers one too" in text) == ((0, False) if name is None else (2, True))
 
 
-@pytest.mark.parametrize("name", ["turned by 180 deg", "numbered from 1, one camera"])
+@pytest.mark.parametrize("name", further_slow(["turned by 180 deg", "numbered from 1, one camera"]))
 def test_a_mistake_fails_the_run_and_is_its_only_explanation(recording, tmp_path, name):
     outcome = process_run(with_mistake(name, recording, tmp_path / "run"), tmp_path / "out")
     assert outcome.exit_status == 4
@@ -266,6 +266,7 @@ def test_poses_that_agree_with_the_truth_pass(symmetric, tmp_path):
     )  # the truth would show what symmetry hides
 
 
+@pytest.mark.slow
 def test_poses_that_the_limited_search_misses_in_a_crowd_are_no_evidence_for_a_mistake(monkeypatch):
     scene = random_scene(50025)  # 13 points per picture, of which 6 are spots
     pictures = SampledFrames()
@@ -614,7 +615,7 @@ def test_a_beam_that_has_moved_is_not_one_whose_ends_are_exchanged(monkeypatch, 
     assert [m.what for m, _ in found] == [words]
 
 
-@pytest.mark.parametrize(("seed", "lamps"), [(0, (39, 20)), (4, (34, 28)), (7, (42, 20)), (10, (36, 28))])
+@pytest.mark.parametrize(("seed", "lamps"), further_slow([(0, (39, 20)), (4, (34, 28)), (7, (42, 20)), (10, (36, 28))]))
 def test_a_spot_that_no_picture_shows_among_lamps_leaves_right_poses_and_no_mistake(tmp_path, seed, lamps):
     """The only spot of a camera is off, and lamps brighter than the spots stay where they are in both cameras."""
     run = simulate("four-skew-beams", tmp_path / "run", seed=seed, frames=30, detections_only=True)

@@ -19,6 +19,7 @@ from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Light, Occlusion
 from lab.simulate.scene import compose
 from lab.simulate.write import simulate
+from tests.marks import further_slow
 
 SMALL = {"picture_scale": 0.25}
 
@@ -33,7 +34,7 @@ def pictures_of(folder, camera):
     return [cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in sorted((folder / "frames" / camera).glob("*.png"))]
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", further_slow(sorted(SCENARIOS), fast=6))
 def test_a_run_folder_is_complete_and_consistent(name, tmp_path):
     folder = simulate(name, tmp_path / "run", seed=1, frames=3 if name == "clocks" else 2, **SMALL)
     result = check(folder)

@@ -9,6 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from geometry.arrays import Array
+from tests.marks import further_slow
 from tracking.background.behind_lights import BehindLights, Exposures, passing_lights
 from tracking.background.joint_fit import JointFit, Modulation, fitted, mean_of
 from tracking.detection.detect import find_spots
@@ -198,7 +199,7 @@ def test_lights_on_ground_of_low_light_hardly_show_what_usual_ground_modulates(m
         assert shown is None or abs(shown.share - modulated) < 2.5 * shown.unlike
 
 
-@pytest.mark.parametrize("length_px", [1.5, 3.0])
+@pytest.mark.parametrize("length_px", further_slow([3.0, 1.5]))
 def test_a_light_that_flickers_by_a_percent_is_measured_as_precisely_as_one_that_does_not(length_px):
     """On texture as fine as the light, which the surface modulates in full."""
     rng = np.random.default_rng(8)

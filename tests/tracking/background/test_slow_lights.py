@@ -380,8 +380,10 @@ def test_pictures_that_a_light_has_left_are_not_taken_for_some_that_show_it(leng
 
 @pytest.mark.parametrize(
     ("at", "apart_px"),
-    [((180.0, 121.0), 12.0), ((300.0, 201.0), 12.0), ((199.0, 250.0), 12.0), ((180.0, 121.0), 16.0),
-     ((300.0, 201.0), 16.0), ((199.0, 250.0), 16.0), ((161.0, 140.0), 16.0)],
+    further_slow([
+        ((180.0, 121.0), 12.0), ((300.0, 201.0), 16.0), ((300.0, 201.0), 12.0), ((199.0, 250.0), 12.0),
+        ((180.0, 121.0), 16.0), ((199.0, 250.0), 16.0), ((161.0, 140.0), 16.0),
+    ], fast=2),
 )  # fmt: skip
 def test_two_lights_that_move_by_their_width_beside_each_other_are_measured_on_edges(at, apart_px):
     """Each of them is in some of the pixels around the other one."""

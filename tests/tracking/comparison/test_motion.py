@@ -77,6 +77,7 @@ def test_differences_at_the_true_alignment_agree_with_the_stated_covariances():
     assert 0.93 < c.within <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("alike", "frames"),
     [pytest.param(0.0, 120, marks=pytest.mark.slow), (4.0, 120), pytest.param(8.0, 240, marks=pytest.mark.slow)],

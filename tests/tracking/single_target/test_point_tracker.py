@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.marks import further_slow
 from tracking.detections import Detections
 from tracking.single_target.blobs import BlobParameters, find_blobs
 from tracking.single_target.point_tracker import PointParameters, PointTracker, track_point
@@ -177,7 +178,7 @@ def disc_behind_an_edge(centre, radius, edge, background=150.0):
     return background - 130 * share
 
 
-@pytest.mark.parametrize("radius", [5.0, 9.0])
+@pytest.mark.parametrize("radius", further_slow([9.0, 5.0]))
 @pytest.mark.parametrize("steps_of_the_edge", [6, 25])
 def test_a_centre_is_uncertain_while_an_edge_hides_a_part_of_the_target(radius, steps_of_the_edge):
     rng, tracker, ratios, sigmas = np.random.default_rng(4), PointTracker(), [], []
@@ -199,7 +200,7 @@ def test_a_centre_is_uncertain_while_an_edge_hides_a_part_of_the_target(radius, 
     assert min(sigmas[-5:]) < 0.1
 
 
-@pytest.mark.parametrize("hidden_frames", [0, 60])
+@pytest.mark.parametrize("hidden_frames", further_slow([60, 0]))
 @pytest.mark.parametrize("px_per_frame", [0.8, 4.0])
 def test_no_frame_of_an_occlusion_is_off_by_more_than_its_sigmas_say(px_per_frame, hidden_frames):
     """Neither the first and the last ones, which hide less than the area shows, nor those of a target found again."""
@@ -220,7 +221,7 @@ def test_no_frame_of_an_occlusion_is_off_by_more_than_its_sigmas_say(px_per_fram
     assert max(ratios) < 6
 
 
-@pytest.mark.parametrize("slow", [25, 50])
+@pytest.mark.parametrize("slow", further_slow([25, 50]))
 def test_a_target_that_grows_while_an_edge_slowly_hides_a_part_of_it_is_off_by_no_more_than_its_sigmas_say(slow):
     """Its area stays as usual; what is left of it is flatter. A part that stays hidden shifts all pictures alike."""
     rng, found, centres = np.random.default_rng(8), [], []

@@ -130,7 +130,7 @@ def fast(seed: int, noise_px: float) -> PointRun:
     return recording_of(RIGS["four-skew-beams"](), poses, t_s, noise_px, seed, turned, prior=prior)
 
 
-@pytest.mark.parametrize("moves", [False, True], ids=["slow", "fast"])
+@pytest.mark.parametrize("moves", further_slow([False, True]), ids=["slow", "fast"])
 @pytest.mark.parametrize(("stated", "least", "most"), [(1.0, 0.85, 1.15), (2.0, 0.2, 0.33)])
 def test_stated_noise_is_reduced_to_what_the_residuals_allow(stated, least, most, moves):
     nees = []

@@ -237,6 +237,7 @@ def in_bands(frame: int) -> Any:
     return 1 + 0.1 * np.sin(0.9 * frame + np.arange(SIZE[0])[:, None] / 27)
 
 
+@pytest.mark.slow
 def test_spots_are_found_in_front_of_rooms_whose_light_changes(tmp_path):
     folder, truth = recording(tmp_path / "run", left=Unsteady(light=flickers), right=Unsteady(light=falls))
     summary = processed(folder, tmp_path / "out")

@@ -166,6 +166,7 @@ def test_a_camera_count_that_starts_again_loses_nothing():
     assert clock.lost == 2
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_too_slow_drops_pictures_which_are_counted(monkeypatch, tmp_path, rig):
     monkeypatch.setattr(recording, "_WAITING", 64)
     slow = recording.encoded

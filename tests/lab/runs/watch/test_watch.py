@@ -201,6 +201,7 @@ def test_pictures_that_come_faster_than_they_are_searched_wait_for_the_first_bac
     assert min(shown[10_000.0]) > 3.0
 
 
+@pytest.mark.slow
 def test_a_camera_that_stops_does_not_stop_the_other(recorded, tmp_path):
     run = empty_copy(recorded, tmp_path / "run")
 

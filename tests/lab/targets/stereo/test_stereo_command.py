@@ -19,6 +19,7 @@ from lab.findings.finding import Verdict
 from lab.number_format import decimals_of
 from lab.targets.stereo.process import findings_of, process_stereo_run
 from lab.targets.stereo.simulated_recording import write_stereo_recording
+from tests.marks import further_slow
 
 FRAMES = 12  # of the recording of points
 
@@ -132,7 +133,8 @@ def test_unsynchronised_pictures_fail_the_run_and_say_by_how_much(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("frames", "shift", "words"), [(4, 2, "0 of 2 frames with markers in both pictures"), (7, 200, "right: 200 to 206")]
+    ("frames", "shift", "words"),
+    further_slow([(7, 200, "right: 200 to 206"), (4, 2, "0 of 2 frames with markers in both pictures")]),
 )
 def test_frame_numbers_of_one_camera_that_are_shifted_fail_the_run(drogue, tmp_path, frames, shift, words):
     """Frames that only one camera has are measured by it alone: without the others they would seem right."""
