@@ -26,6 +26,7 @@ from lab.runs.model_check.symmetry import Recorded
 from lab.runs.process import process_run
 from lab.simulate.scenarios import four_skew_beams, unequal_fan
 from lab.simulate.write import simulate
+from tests.marks import further_slow
 from tracking.parameters import LabelParameters
 
 MIRROR_SIGMAS = bench.Sigmas((3e-3, 1.7e-3), (2e-3, 1e-3), (1e-3, 1e-3), clocks=0.0)
@@ -112,7 +113,8 @@ def test_a_run_whose_rig_has_a_covariance_reports_what_it_hides(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("seed", "names", "words"), [(9121, ["left"], "camera `left`"), (9121, ["left", "right"], "all cameras")]
+    ("seed", "names", "words"),
+    further_slow([(9121, ["left"], "camera `left`"), (9121, ["left", "right"], "all cameras")]),
 )
 def test_mirrored_pictures_are_named_although_other_labels_give_poses(tmp_path, seed, names, words):
     """Too few of these poses were determined, or none explained the recording: refused without the reason, or a FAIL.

@@ -11,6 +11,7 @@ import time
 import pytest
 
 from lab.runs.batch.batch import THREAD_VARIABLES, performed, threads_per_process
+from tests.marks import further_slow
 
 
 def square_or_die(number: int) -> int:
@@ -61,7 +62,7 @@ def _raise_at_the_first(error: type[BaseException]) -> None:
             raise error
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("error", further_slow([KeyboardInterrupt, SystemExit]))
 def test_an_interruption_of_the_parent_ends_the_processes(error):
     before = set(multiprocessing.active_children())
     with pytest.raises(error):

@@ -209,6 +209,7 @@ def test_cameras_that_average_their_pictures_over_time_are_named(tmp_path, share
     assert verdict["status"] == ("check" if share else "pass")
 
 
+@pytest.mark.slow
 def test_cameras_with_interlaced_pictures_are_named(tmp_path):
     """The odd rows of the camera on the left are those of the next picture. The room has lines along the rows."""
     folder, _ = recording(tmp_path / "run", right=Unsteady(light=lined))
@@ -267,6 +268,7 @@ def test_spots_are_found_where_the_room_changes_during_the_recording(tmp_path):
     assert (spots.groupby(["camera", "spot"]).status.agg(lambda s: (s == "matched").mean()) > 0.75).all()
 
 
+@pytest.mark.slow
 def test_light_in_bands_hides_no_spot(tmp_path):
     folder, truth = recording(tmp_path / "run", left=Unsteady(light=in_bands))
     matched = shares_of_a_run_without_wrong_poses(folder, truth)
