@@ -190,6 +190,7 @@ def test_corners_in_any_order_are_renumbered_correctly():
         np.testing.assert_array_equal(chessboard_detection.oriented(photo.image, given), true)
 
 
+@pytest.mark.slow
 def test_no_corner_that_is_fitted_beside_its_place_is_taken_for_measured():
     found = rendered.rendered_set("fisheye", BOARDS["chess"], 74001, 1)
     assert len(found.table) == 54

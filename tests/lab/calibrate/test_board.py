@@ -16,11 +16,12 @@ from calibration.boards.board_view import BoardView
 from lab.calibrate.board import as_pdf, lay_out, write_board
 from lab.errors import InputError
 from lab.files.rig.board_file import load_board, load_board_or_text
+from tests.marks import further_slow
 
 TEXTS = ["chessboard:9x6:25mm", "acircles:4x11:20mm", "charuco:5x7:36mm:27mm:DICT_4X4_50:inverted"]
 
 
-@pytest.mark.parametrize(("text", "dpi"), list(zip(TEXTS, (300, 150, 300), strict=True)))
+@pytest.mark.parametrize(("text", "dpi"), further_slow(zip(TEXTS, (300, 150, 300), strict=True)))
 def test_a_printed_picture_shows_the_board_at_its_size(tmp_path, text, dpi):
     outcome = write_board(text, tmp_path / "b", dpi=dpi)
     data = (tmp_path / "b" / "board.png").read_bytes()

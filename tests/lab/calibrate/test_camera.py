@@ -183,6 +183,7 @@ def test_copies_of_one_photograph_count_once(tmp_path):
         calibrate_camera([tmp_path], BOARD, tmp_path / "out")
 
 
+@pytest.mark.slow
 @needs_stereo
 def test_copies_of_other_quality_change_nothing_and_are_named(tmp_path):
     """With copies as photographs of their own the sigmas would be too small by the root of the number of copies."""

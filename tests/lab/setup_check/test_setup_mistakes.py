@@ -432,6 +432,7 @@ def video(path: Path, size: tuple[int, int] = (64, 48), rate: float = 25.0, four
     return path
 
 
+@pytest.mark.slow
 def test_errors_larger_than_the_sigmas_do_not_accuse_lenses_that_are_the_same_by_design(symmetric, tmp_path):
     run = shutil.copytree(symmetric, tmp_path / "run")
     points = pd.read_csv(run / "detections.csv")

@@ -5,6 +5,7 @@ import pytest
 
 from bench.detection import scene_of
 from geometry.camera import SensorNoise
+from tests.marks import further_slow
 from tests.tracking.rendering import Scene, Spot, photograph
 from tracking.detection.detect import SpotFinder, find_spots
 from tracking.detections import Detections
@@ -27,7 +28,7 @@ def assert_same(image: Picture, regions: np.ndarray) -> int:
     return len(part)
 
 
-@pytest.mark.parametrize("kind", ["main", "faint", "near", "edge", "wide", "small", "speckle"])
+@pytest.mark.parametrize("kind", further_slow(["main", "edge", "wide", "faint", "near", "small", "speckle"], fast=3))
 def test_regions_give_the_same_spots_as_the_whole_picture(kind):
     rng = np.random.default_rng([3, len(kind)])
     scene = scene_of(kind, rng)

@@ -21,11 +21,9 @@ def is_a_covariance(P: np.ndarray) -> bool:
     ("camera", "gap"),
     [
         (0, slice(110, FRAMES)),
-        (1, slice(60, FRAMES)),
-        (0, slice(0, 12)),
         *(
             pytest.param(c, slice(*s), marks=pytest.mark.slow)
-            for c, s in ((1, (110, FRAMES)), (0, (60, FRAMES)), (1, (0, 12)))
+            for c, s in ((1, (60, FRAMES)), (0, (0, 12)), (1, (110, FRAMES)), (0, (60, FRAMES)), (1, (0, 12)))
         ),
     ],
 )

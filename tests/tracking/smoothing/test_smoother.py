@@ -14,6 +14,7 @@ from bench.random_scenes.oracle import ask_oracle
 from bench.random_scenes.scene import random_scene
 from geometry.pose import Pose
 from lab.simulate.points import PointRun, simulate_points
+from tests.marks import further_slow
 from tests.tracking.rigid_runs import (
     RIGID,
     Assessment,
@@ -60,7 +61,7 @@ CASES: list[tuple[str, tuple[str, int] | None]] = [
 ]
 
 
-@pytest.mark.parametrize(("scenario", "hide"), CASES)
+@pytest.mark.parametrize(("scenario", "hide"), further_slow(CASES, fast=3))
 def test_the_smoothing_pass_labels_no_fewer_spots_and_none_wrongly(scenario, hide):
     causal, again = judged_both(both_passes(scenario, 7001, 200, hide))
     assert again.missed() <= causal.missed() + 1

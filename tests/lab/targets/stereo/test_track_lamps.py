@@ -17,6 +17,7 @@ from geometry.pose import Pose
 from lab.report.page import PageDrawing
 from lab.report.plot.series import Band
 from lab.targets.stereo.page import pose_section
+from tests.marks import further_slow
 from tracking.binocular.pose_tracker import BinocularFrame
 from tracking.statuses import PoseStatus
 
@@ -59,7 +60,7 @@ def test_harris_corners_give_the_same_motion(recording):
 
 
 @pytest.mark.parametrize("count", [1, pytest.param(6, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", ["cloud", "ground", "water"])
+@pytest.mark.parametrize("kind", further_slow(["cloud", "water", "ground"], fast=2))
 def test_pictures_without_the_target_have_no_pose(recording, kind, count):
     folder, _, _ = recording
     (folder / kind).mkdir(exist_ok=True)
