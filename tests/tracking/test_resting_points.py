@@ -36,24 +36,3 @@ def test_spots_that_creep_are_no_lamps_although_false_points_are_elsewhere_in_ea
 def test_a_vehicle_at_rest_beside_lamps_is_not_at_rest_itself():
     lamps = np.random.default_rng(3).uniform([0, 0], SIZE, (12, 2))
     assert not len(resting_places({"left": threes(0.0, lamps, 0)}, 4, 0.55)["left"])
-
-
-def swing(px: float, noise_px: float, shake_px: float, lamps: np.ndarray) -> list[tuple[np.ndarray, ...]]:
-    """30 frames with their neighbours: four spots that swing so far about their places, and lamps; all shake alike."""
-    rng = np.random.default_rng(4)
-
-    def frame(k: int) -> np.ndarray:
-        uv = np.concatenate([SPOTS + px * np.sin(0.3 * k) * np.array([0.7, 0.7]), lamps])
-        return uv + rng.normal(0.0, noise_px, uv.shape) + rng.normal(0.0, shake_px, 2)
-
-    return [tuple(frame(k + i) for i in (-1, 0, 1)) for k in range(1, 120, 4)]
-
-
-def test_spots_far_from_a_camera_that_stay_near_their_places_are_no_lamps():
-    """Of a swing of 1.5 px a camera lost all its spots: another camera saw the same vehicle move."""
-    lamps = np.random.default_rng(3).uniform([0.0, 2000.0], [1280.0, 3000.0], (12, 2))
-    for noise_px, shake_px in ((0.05, 0.0), (0.25, 0.0), (0.1, 0.2)):
-        views = {"far": swing(1.5, noise_px, shake_px, lamps), "near": swing(10.0, noise_px, shake_px, SPOTS[:0])}
-        places = resting_places(views, 4, 0.55)["far"]
-        assert at_places(lamps, places).all()
-        assert not at_places(SPOTS, places).any()

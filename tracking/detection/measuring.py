@@ -104,11 +104,10 @@ def measure(
         if not _merge_parts(table):
             break
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, True, cells, algebra)
-    restarted, before = np.zeros(chosen.shape[0], np.bool_), table.copy()
+    restarted = np.zeros(chosen.shape[0], np.bool_)
     if _start_again(image, peaks, chosen, table, limits, restarted):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, False, cells, algebra)
         _drop_background(table, restarted)
-        _keep_better(table, before, restarted)
     if _hold_unresolved(peaks, chosen, table, limits):
         fit_all(image, table, noise, limits.saturation, limits.max_sigma, least, True, False, cells, algebra)
         _judge_unresolved(image, table, noise, limits)
@@ -116,12 +115,8 @@ def measure(
         spot = table[k]
         here = with_texture(noise, spot["texture"])
         accepted = _is_spot(image, spot, here, limits)
-        peak = peaks[chosen[k]]
-        # The Gaussian of a clipped light on a bright square may be that of the square, whose edges are no texture.
-        square = spot["explained"] < limits.min_explained and _is_clipped(image, peak, limits)
-        if square or not (accepted and _is_as_wide(spot)):
-            around = with_texture(noise, 0.0) if square else here
-            core = _is_core(image, peak, table[k : k + 1], around, limits, cells[SCRATCH])
+        if not (accepted and _is_as_wide(spot)):
+            core = _is_core(image, peaks[chosen[k]], table[k : k + 1], here, limits, cells[SCRATCH])
             accepted = accepted or core
         accepted = accepted or _is_compact(image, spot, here, limits, _CLEAR, cells[SCRATCH])
         spot["accepted"] = 1.0 if accepted else 0.0
@@ -183,17 +178,16 @@ def _start_again(
     Marks them in restarted (n,). A saturated light starts from its pixels above half of its height.
 
     On a sloping or textured background the window of the moments grows over the light beside a faint spot, or the fit
-    over that beside a saturated one, a bright square, or it shrinks to a grain of the light; then it explains little.
+    over that beside a saturated one, or it shrinks to a grain of the light; then it explains little.
     """
     found = False
     for k in range(table.shape[0]):
         spot, peak = table[k], peaks[chosen[k]]
         spot["active"] = 0.0
         start = max(spot["start"], _LEAST_START)
-        clipped = _is_clipped(image, peak, limits)
         poor = spot["explained"] < limits.min_explained
         major2 = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1]
-        poor = poor and (clipped or major2 > _OUTGROWN**2 * start or major2 * _OUTGROWN < spot["start"])
+        poor = poor and (major2 > _OUTGROWN**2 * start or major2 * _OUTGROWN < spot["start"])
         if (spot["flux"] > 0.0 and not poor) or spot["moment_uu"] >= _NOTHING or peak["wide"]:
             continue
         away = max(abs(spot["moment_u"] - peak["u"]), abs(spot["moment_v"] - peak["v"]))
@@ -203,8 +197,8 @@ def _start_again(
         spot["moment_u"], spot["moment_v"] = peak["u"], peak["v"]
         spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = start, 0.0, start
         spot["flux"], spot["active"] = 2 * pi * start * peak["height"], 1.0
-        if clipped:
-            at_half_height(image, peak, _LARGEST_CORE, _SATURATED * limits.saturation, spot)
+        if pixel(image, int(peak["u"]), int(peak["v"])) >= _SATURATED * limits.saturation:
+            at_half_height(image, peak, _LARGEST_CORE, spot)
         restarted[k] = found = True
     return found
 
@@ -227,15 +221,6 @@ def _drop_background(table: Candidates, restarted: Bools) -> None:
         wide = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1] > _OUTGROWN * spot["moment_uu"]
         if wide or height * _STEEPEST < rise:
             spot["flux"] = 0.0
-
-
-@compiled
-def _keep_better(table: Candidates, before: Candidates, restarted: Bools) -> None:
-    """Of restarted fits (n,) that explain no more than those before, or have failed, keep those before."""
-    for k in range(table.shape[0]):
-        better = table[k]["flux"] > 0.0 and table[k]["explained"] > before[k]["explained"]
-        if restarted[k] and before[k]["flux"] > 0.0 and not better:
-            table[k] = before[k]
 
 
 @compiled
@@ -350,11 +335,6 @@ def _is_spot(image: Pixels, spot: Candidate, noise: Noise, limits: DetectionLimi
 
 
 @compiled
-def _is_clipped(image: Pixels, peak: Peak, limits: DetectionLimits) -> bool:
-    return pixel(image, int(peak["u"]), int(peak["v"])) >= _SATURATED * limits.saturation
-
-
-@compiled
 def _is_as_wide(spot: Candidate) -> bool:
     """Whether a fit is about as wide as the light from which it started."""
     major2 = ellipse.eigenvalues(spot["uu"], spot["uv"], spot["vv"])[1]
@@ -371,11 +351,11 @@ def _is_core(
     spot (1,): the candidate.
     """
     before, start = spot.copy(), max(spot[0]["start"], _LEAST_START)
-    at_half_height(image, peak, _LARGEST_CORE, _SATURATED * limits.saturation, spot[0])
+    at_half_height(image, peak, _LARGEST_CORE, spot[0])
     wide2, found = 0.5 * (spot[0]["moment_uu"] + spot[0]["moment_vv"]), spot[0]["flux"] != before[0]["flux"]
     as_wide = not peak["wide"] and found and start < _OUTGROWN * wide2 and wide2 < _OUTGROWN * start
     compact = as_wide and _is_compact(image, spot[0], noise, limits, _EVEN, scratch)
-    if compact and (_is_clipped(image, peak, limits) or light_ends(image, spot[0], _EVEN * spot[0]["peak"], scratch)):
+    if compact and light_ends(image, spot[0], _EVEN * spot[0]["peak"], scratch):
         return True
     spot[0] = before[0]
     return False

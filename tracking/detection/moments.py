@@ -43,9 +43,6 @@ _RADII = (0.4, 0.8, 2.4, 2.8, 3.2)  # sigmas of the moments' ellipse: two in the
 CENTRE_SHARE = 0.15
 _OF_HALF = 2.885  # variance of a Gaussian over that of its pixels above half of its height: 2 / ln 2
 _FEWEST = 5  # such pixels, that a start is taken from
-# Share of them that is not clipped, at least: a Gaussian of twice the clipped height has half. The edges of brighter
-# lights are steeper.
-_LEAST_BELOW = 0.5
 _THRESHOLD_FACTOR = 1.5  # factor on the noise in the detection threshold, because no fit confirms the spot
 
 _STEPS, _SIGMAS = (1, 2, 4, 8), (0.6, 1.0, 1.6, 2.5)  # px; of these steps
@@ -337,12 +334,10 @@ def _adapt_window(window: Window, light: Array, spot: Candidate, lines: Array) -
 
 
 @compiled
-def at_half_height(image: Pixels, peak: Peak, half: int, clipped: float, spot: Candidate) -> None:
+def at_half_height(image: Pixels, peak: Peak, half: int, spot: Candidate) -> None:
     """Set the moments of a spot to those of the connected pixels above half of a peak, and its flux accordingly.
 
-    As they are where these pixels are few, or reach a side of the square of so many px to each side. clipped, DN: from
-    where on pixels are clipped. A Gaussian fills an area of 2 pi sigma^2 log 2 between some height and half of it,
-    however much of it is clipped. Source: ours.
+    As they are where these pixels are few, or reach a side of the square of so many px to each side. Source: ours.
     """
     side = 2 * half + 1
     left, top = int(peak["u"]) - half, int(peak["v"]) - half
@@ -351,7 +346,7 @@ def at_half_height(image: Pixels, peak: Peak, half: int, clipped: float, spot: C
     waiting[0] = half * side + half
     seen[waiting[0]] = 1
     done, count = 0, 1
-    n, below, u, v, uu, uv, vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    n, u, v, uu, uv, vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     while done < count:
         k = waiting[done]
         done += 1
@@ -359,7 +354,6 @@ def at_half_height(image: Pixels, peak: Peak, half: int, clipped: float, spot: C
         if i == 0 or j == 0 or i == side - 1 or j == side - 1:
             return
         n, x, y = n + 1.0, float(j - half), float(i - half)
-        below += 1.0 if pixel(image, left + j, top + i) < clipped else 0.0
         u, v, uu, uv, vv = u + x, v + y, uu + x * x, uv + x * y, vv + y * y
         for step in (-side, -1, 1, side):
             other = k + step
@@ -370,13 +364,12 @@ def at_half_height(image: Pixels, peak: Peak, half: int, clipped: float, spot: C
                 count += 1
     if n < _FEWEST:
         return
-    u, v, share = u / n, v / n, max(below / n, _LEAST_BELOW)
-    factor = _OF_HALF * share
-    uu, uv, vv = factor * (uu / n - u * u), factor * (uv / n - u * v), factor * (vv / n - v * v)
+    u, v = u / n, v / n
+    uu, uv, vv = _OF_HALF * (uu / n - u * u), _OF_HALF * (uv / n - u * v), _OF_HALF * (vv / n - v * v)
     spot["moment_u"], spot["moment_v"] = peak["u"] + u, peak["v"] + v
     spot["moment_uu"], spot["moment_uv"], spot["moment_vv"] = ellipse.clip_eigenvalues(uu, uv, vv, 0.5, np.inf)
     det = spot["moment_uu"] * spot["moment_vv"] - spot["moment_uv"] ** 2
-    spot["flux"] = 2 * pi * sqrt(det) * peak["height"] * 2.0 ** (1.0 / share - 1.0)
+    spot["flux"] = 2 * pi * sqrt(det) * peak["height"]
 
 
 @compiled
