@@ -13,9 +13,9 @@ needs_open3d = pytest.mark.usefixtures("loaded_open3d")
 
 
 def further_slow(cases: Iterable[Any], fast: int = 1) -> list[Any]:
-    """The cases of a parametrized test; those after the first `fast` are marked as slow."""
-    marked = []
-    for number, case in enumerate(cases):
-        values = case if isinstance(case, tuple) else (case,)
-        marked.append(case if number < fast else pytest.param(*values, marks=pytest.mark.slow))
-    return marked
+    """The cases of a parametrized test; those after the first `fast` are marked as slow.
+
+    cases: tuples of the test's parameters, or the only one.
+    """
+    every = [case if isinstance(case, tuple) else (case,) for case in cases]
+    return [pytest.param(*case, marks=pytest.mark.slow if n >= fast else ()) for n, case in enumerate(every)]

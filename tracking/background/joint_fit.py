@@ -157,6 +157,10 @@ class _Pixels:
         usual = np.concatenate([usual, flicker])
         return _Seen(du, dv, along, across, form, light_of, root, slope, behind, information, residual, usual)
 
+    def structure(self, light: JointLight, seen: _Seen) -> Array:
+        """The background (m,) without its plane, DN."""
+        return np.asarray(seen.behind - light.plane[0] - (self.uv - light.origin) @ light.plane[1:])
+
     def normal(self, light: JointLight, seen: _Seen) -> tuple[Array, Array]:
         """Normal matrix and right side of the step, with the background eliminated."""
         n, m = self.values.shape
@@ -286,8 +290,8 @@ def fitted(
     for _ in range(_ROUNDS):
         light = _descended(pixels, light)
         seen = pixels.seen(light)
-        about = seen.behind - light.plane[0] - (uv - origin) @ light.plane[1:]
-        light = replace(light, texture_dn=_ALIKE * max(float(np.std(about)), _LEAST_TEXTURE * noise_dn))
+        texture_dn = float(np.std(pixels.structure(light, seen)))
+        light = replace(light, texture_dn=_ALIKE * max(texture_dn, _LEAST_TEXTURE * noise_dn))
     light = _descended(pixels, light)
     return _checked(pixels, light, width_px)
 
@@ -343,6 +347,6 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     shared = max(every - (1 + 1 / n) * own, 0.0) * max(chi2, 1.0) + (_LEAST_SIGMA * float(widths.max())) ** 2
     strength_cov = covariance[:2, :2] * max(chi2, 1.0)
     lit = np.sum(seen.light_of**2, axis=0)
-    about = seen.behind - light.plane[0] - (pixels.uv - light.origin) @ light.plane[1:]
-    noise_share = min(float(np.sum(lit / seen.information) / max(np.sum(lit * about**2), 1e-300)), 1.0)
+    structure2 = float(np.sum(lit * pixels.structure(light, seen) ** 2))
+    noise_share = min(float(np.sum(lit / seen.information)) / max(structure2, 1e-300), 1.0)
     return JointFit(light, float(shared / max(own, 1e-9)), strength_cov, pixels.usual, pixels.modulated, noise_share)

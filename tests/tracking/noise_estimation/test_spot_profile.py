@@ -8,6 +8,7 @@ import pytest
 
 from geometry.camera import SensorNoise
 from lab.runs.frames.sensor_noise import CameraNoise
+from tests.marks import further_slow
 from tests.tracking.rendering import Scene, Spot, photograph
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
@@ -68,7 +69,7 @@ def amplitude(error: np.ndarray, places: np.ndarray) -> float:
     return float(np.mean(waves))
 
 
-@pytest.mark.parametrize("parts", [WINGED[0], *(pytest.param(w, marks=pytest.mark.slow) for w in WINGED[1:])])
+@pytest.mark.parametrize("parts", further_slow((w,) for w in WINGED))
 def test_with_their_profile_the_error_depends_less_on_the_place_within_a_pixel(parts):
     shown, centres = recording(parts)
     model = estimate_noise(shown).model

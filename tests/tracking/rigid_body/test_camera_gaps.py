@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lab.simulate.points import simulate_points
+from tests.marks import further_slow
 from tests.tracking.rigid_runs import assess, smoothed_frames, tracked, without_pictures
 from tracking.statuses import TrackedFrame
 
@@ -19,13 +20,7 @@ def is_a_covariance(P: np.ndarray) -> bool:
 
 @pytest.mark.parametrize(
     ("camera", "gap"),
-    [
-        (0, slice(110, FRAMES)),
-        *(
-            pytest.param(c, slice(*s), marks=pytest.mark.slow)
-            for c, s in ((1, (60, FRAMES)), (0, (0, 12)), (1, (110, FRAMES)), (0, (60, FRAMES)), (1, (0, 12)))
-        ),
-    ],
+    further_slow((c, slice(*s)) for s in ((110, FRAMES), (60, FRAMES), (0, 12)) for c in (0, 1)),
 )
 def test_a_gap_of_a_camera_to_the_end_or_from_the_start_makes_no_pose_confidently_wrong(camera, gap):
     for scenario in ("smooth", "sharp-turns"):

@@ -59,7 +59,7 @@ def test_harris_corners_give_the_same_motion(recording):
         assert abs(float(one["z_m"]) - float(other["z_m"])) < 0.05
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", further_slow([1, 6]))
 @pytest.mark.parametrize("kind", further_slow(["cloud", "water", "ground"], fast=2))
 def test_pictures_without_the_target_have_no_pose(recording, kind, count):
     folder, _, _ = recording
