@@ -22,6 +22,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigUncertainty
 from tracking.detections import Detections
 from tracking.labelling.first_labels import NO_POINT, Labelling, candidate_labellings, find_labels
+from tracking.labelling.search import plan_of
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import (
     BLENDED,
@@ -114,6 +115,15 @@ class Acquisition:
             min(0.05 + speed * age_s, max(MAX_DISTANCE_M, self._prior.within_m)),
             min(np.deg2rad(3.0) + rate * age_s, max(MAX_TURN_RAD, self._prior.within_rad)),
         )
+
+    def log_visible(self, prior: PosePrior) -> float:
+        """Log of how many times larger a region of poses is than that of the poses which show enough spots.
+
+        A vehicle that is yet to be found is one whose spots the pictures show: long lenses see them from a small part
+        of the region only, as the evidence of a search (tracking/labelling) takes into account as well.
+        """
+        shown = plan_of(self._rig, self._model, self._parameters.labels.min_spots).log_volume
+        return max(prior.log_volume - shown, 0.0)
 
     def is_ambiguous(self, pose: Pose, age_s: float) -> bool:
         """Whether the prior allows another pose of a symmetric vehicle, which shows the same spots.

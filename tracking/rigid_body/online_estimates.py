@@ -295,7 +295,8 @@ class PointStatistics:
         if any(f.at_rest is not None for f in some):
             at_rest = np.concatenate([np.zeros(len(f)) if f.at_rest is None else f.at_rest for f in some]) > 0
             static[at_rest] = np.maximum(static[at_rest], SURE_LOG_DENSITY)
-        log_clutter, log_excess = self._clutter.log_density(first_rows)
+        elsewhere = np.concatenate([[0], np.cumsum(static == -np.inf)])[first_rows]  # those at no static place
+        log_clutter, log_excess = self._clutter.log_density(elsewhere)
         if first:
             # The excess of clutter near spots must not make points without any spot evidence of a vehicle.
             log_clutter, log_excess = log_clutter - log_excess, np.zeros_like(log_excess)

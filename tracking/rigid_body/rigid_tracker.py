@@ -279,6 +279,7 @@ class RigidTracker:
         candidates = self._acquisition.labellings(obs.frame, found, prior, first, static_too, events)
         # A vehicle that was never measured may as well appear now; else it is rarely off all predictions.
         log_weight = 0.0 if self._hypotheses is None else -self._evidence.nats if first else float(np.log(P_NEW))
+        log_weight += self._acquisition.log_visible(prior) if first else 0.0
         visibilities = len(self.model) + self._groups
         shares = SEARCH_SHARES if obs.timed else SEARCH_SHARES[:1]
         starts = [unknown_vehicle(prior, log_weight, visibilities, share) for share in shares]
