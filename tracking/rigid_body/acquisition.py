@@ -31,6 +31,7 @@ from tracking.rigid_body.association.frame_detections import (
     Observation,
     detection_log_likelihood,
     distinct_spots,
+    in_picture,
     log_clutter_ratio,
 )
 from tracking.rigid_body.frame_summary import is_lost
@@ -47,7 +48,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
 )
 from tracking.rigid_body.models.information import has_clocks
 from tracking.rigid_body.models.motion import ANY_MOMENT, predicted
-from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
+from tracking.rigid_body.models.occlusion import MISSED, predict, update
 from tracking.statuses import Event
 
 # Sigmas of the motion of a vehicle that has just been found.
@@ -293,7 +294,6 @@ def add_pose(
     children: Children, count: int, obs: Observation, model: SpotModel, start: Start, assigned: Ints, pose: Pose
 ) -> tuple[int, int]:
     """Add the update of a state by an assignment (n,) near a pose; see `add_child` for the result."""
-    group, p_detect = obs.view_table.group, obs.detection_model.p_detect
     state, log_likelihood, _, _ = iterated_update(
         obs, start.state, assigned, np.array(pose.rotation, order="C"), np.array(pose.translation)
     )
@@ -302,11 +302,11 @@ def add_pose(
     assigned = np.where((assigned < 0) & ~inside, NOT_SEARCHED, assigned)
     log_weight = start.log_weight
     log_weight += log_likelihood + log_clutter_ratio(obs, state.R, state.t, state.P)
-    log_weight += detection_log_likelihood(obs, marginal(start.p_visible, group), assigned, state.R, state.t)
-    log_weight += joint_log_likelihood(start.p_visible, group, assigned, p_detect)
+    p_in = in_picture(obs, assigned, state.R, state.t)
+    log_weight += detection_log_likelihood(obs, start.p_visible, assigned, p_in)
     if not np.isfinite(log_weight):
         return count, -1
-    after = update(start.p_visible, group, assigned, p_detect)
+    after = update(start.p_visible, obs.view_table.group, assigned, obs.detection_model.p_detect * p_in)
     return add_child(children, count, state, log_weight, after, assigned, False, start.parent)
 
 

@@ -19,11 +19,11 @@ from tracking.rigid_body.acquisition import Acquisition
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus, TrackedFrame
 
-ANGLES_DEG = (-5.0, 5.0)
+def two_beams(focal_px: float, angle_deg: float = 5.0) -> Rig:
+    """Two beams 10 deg apart with both ends visible on screens 2.5 m away on either side: spots 44 cm apart.
 
-
-def two_beams(focal_px: float) -> Rig:
-    """Two beams 10 deg apart with both ends visible on screens 2.5 m away on either side: spots 44 cm apart."""
+    angle_deg: half of the angle between them.
+    """
     like = fan()
     cameras = {}
     for name, camera in like.cameras.items():
@@ -34,7 +34,7 @@ def two_beams(focal_px: float) -> Rig:
         cameras[name] = replace(camera, matrix=matrix, distortion=(), camera_from_world=aimed)
     beams = {
         name: Beam(name, np.array([np.cos(a), np.sin(a), 0.0]), np.zeros(3))
-        for name, a in zip("AB", np.deg2rad(ANGLES_DEG), strict=True)
+        for name, a in zip("AB", np.deg2rad([-angle_deg, angle_deg]), strict=True)
     }
     spots = {
         name: Spot(name, beam, sign, screen)
@@ -63,6 +63,36 @@ def test_a_vehicle_at_rest_with_two_beams_is_found_in_the_first_frames(focal_px,
         assert all(f.pose_status is PoseStatus.MEASURED for f in causal[3:])
         again, _ = smoothed_frames(run, causal)
         assert assess(run, again).identity == 1.0
+
+
+def with_points_at_rest(found: list[Detections | None], rng: np.random.Generator, at: Array) -> list[Detections | None]:
+    """The detections with false points (m, 2), px, at rest: edges of objects, whose centres are hardly known."""
+    out: list[Detections | None] = []
+    for one in found:
+        assert one is not None
+        cov = np.concatenate([one.cov_px2, np.tile(np.eye(2), (len(at), 1, 1))])
+        out.append(Detections.at(np.concatenate([one.uv_px, at + 0.01 * rng.normal(size=at.shape)]), cov))
+    return out
+
+
+@pytest.mark.parametrize("spots", [4, 0])
+def test_long_lenses_find_a_vehicle_of_four_spots_among_many_points_at_rest_from_a_wide_prior(spots):
+    """Its spots are shown by a thousandth of the prior's poses. Points at rest alone are never a vehicle."""
+    rig = two_beams(25000.0, 1.0)
+    prior = PosePrior(Pose.identity(), 1.5, np.deg2rad(20.0))
+    for seed in range(4):
+        rng = np.random.default_rng([seed, 2])
+        at = Pose.from_ypr(np.deg2rad([0.4, 0.2, 0.4]) * rng.uniform(-1, 1, 3), 0.02 * rng.uniform(-1, 1, 3))
+        sway = np.deg2rad(0.3) * np.sin(2 * np.pi * 0.4 * np.arange(12) / 75.0)
+        poses = Pose.from_ypr(np.stack([sway, sway, sway], axis=1) + at.ypr, np.tile(at.translation, (12, 1)))
+        run = recording_of(rig, poses, np.arange(12) / 75.0, 0.05, seed)
+        tracker, at_rest = RigidTracker(rig, RIGID, prior), rng.uniform(0, 1000, (40, 2))
+        for k, found in enumerate(run.detections):
+            shown = [None if f is None else f[np.arange(len(f) if spots else 0)] for f in found]
+            frame = tracker.step(1 / 75.0 if k else 0.0, with_points_at_rest(shown, rng, at_rest))
+            assert (frame.pose_status is PoseStatus.MEASURED) == (spots > 0) or k < 3
+            if spots and k >= 3:
+                assert np.linalg.norm(frame.pose.minus(poses[k])[3:]) < np.deg2rad(0.05)
 
 
 def test_a_vehicle_is_found_at_once_after_an_occlusion_wherever_the_prediction_has_drifted():

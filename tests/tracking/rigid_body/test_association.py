@@ -22,13 +22,14 @@ from tracking.rigid_body.association.frame_detections import (
     FrameDetections,
     Observation,
     ViewTable,
+    detection_log_likelihood,
     distinct_spots,
     is_blended,
     log_clutter_ratio,
     p_in_picture,
 )
 from tracking.rigid_body.association.joint_search import GATE_CHI2, WIDE_PRUNE_NATS, associate
-from tracking.rigid_body.models.occlusion import MISSED
+from tracking.rigid_body.models.occlusion import MISSED, P_BLACKOUT
 
 RIG = RIGS["fan"]()
 MODEL = SpotModel.of(RIG)
@@ -50,7 +51,7 @@ class Found:
 
     assigned: Ints
     score: Array
-    counted: Array
+    p_in: Array
 
 
 def frame_of(
@@ -182,11 +183,26 @@ def test_the_search_finds_the_best_of_all_assignments(cameras, most, seeds):
     assert compared >= 0.8 * len(seeds)
 
 
-def test_the_score_is_also_given_without_its_gaussian_terms():
+def test_a_frame_in_which_nothing_is_found_is_no_evidence_of_a_vehicle():
+    """Spots that may be anywhere may be outside the pictures: then nothing follows from not finding them."""
+    p_visible = np.full(N + 2, 0.95)
+    for sigma_m in (1e-3, 0.03, 0.3, 3.0):
+        frame = frame_of([np.zeros((0, 2)), np.zeros((0, 2))])
+        found = search(frame, np.diag(np.repeat([sigma_m, sigma_m], 3) ** 2))
+        assert len(found.assigned) == 1
+        assert np.all(found.assigned[0] < 0)
+        nats = detection_log_likelihood(observed(frame), p_visible, found.assigned[0], found.p_in[0])
+        assert nats <= np.log(1 + P_BLACKOUT)
+    assert nats > -1.0  # with the widest prediction hardly any spot is probably in its picture
+
+
+def test_spots_that_are_found_count_with_their_detection_and_the_density_of_false_points():
     frame = frame_of([EXPECTED[MODEL.camera_of == c] for c in range(2)])
     found = search(frame)
     np.testing.assert_array_equal(found.assigned[0], np.argsort(np.argsort(MODEL.camera_of, kind="stable")))
-    assert found.counted[0] == pytest.approx(N * (np.log(DETECTION_MODEL.p_detect * P_UNOCCLUDED[0]) - LOG_CLUTTER))
+    p_visible = np.full(N + 2, 1.0 - 1e-12)
+    nats = detection_log_likelihood(observed(frame), p_visible, found.assigned[0], found.p_in[0])
+    assert nats == pytest.approx(N * (np.log(DETECTION_MODEL.p_detect) - LOG_CLUTTER))
 
 
 def test_a_false_point_in_the_first_gate_is_rejected_once_the_other_spots_have_narrowed_it():

@@ -38,10 +38,8 @@ def over_all_states(p_visible: Array, assigned: Array) -> tuple[float, Array]:
 
 
 def log_probability(p_visible: Array, assigned: Array) -> float:
-    """The log-likelihood as the tracker computes it: marginals, and the correction for common occlusion."""
-    p = DETECT * marginal(p_visible, GROUP)
-    marginals = np.where(assigned >= 0, np.log(p), np.log(1 - p))[assigned != NOT_LOOKED_FOR]
-    return float(marginals.sum()) + joint_log_likelihood(p_visible, GROUP, assigned, DETECT)
+    """The log-likelihood as the tracker computes it."""
+    return joint_log_likelihood(p_visible, GROUP, assigned, np.full(N, DETECT))
 
 
 @given(all_probabilities)
@@ -63,7 +61,7 @@ def test_the_likelihood_of_an_outcome_is_the_sum_over_all_states(p_visible, assi
 @given(all_probabilities, outcome)
 def test_the_update_follows_bayes_rule(p_visible, assigned):
     a = np.array(assigned)
-    after = update(p_visible, GROUP, a, DETECT)
+    after = update(p_visible, GROUP, a, np.full(N, DETECT))
     if np.any(a >= 0):  # else P_BLACKOUT contributes
         np.testing.assert_allclose(after, over_all_states(p_visible, a)[1], atol=3e-6)
 
@@ -71,7 +69,7 @@ def test_the_update_follows_bayes_rule(p_visible, assigned):
 @given(all_probabilities, st.lists(outcome, min_size=1, max_size=30))
 def test_probabilities_stay_between_0_and_1(p_visible, outcomes):
     for assigned in outcomes:
-        p_visible = update(predict(p_visible, N), GROUP, np.array(assigned), DETECT)
+        p_visible = update(predict(p_visible, N), GROUP, np.array(assigned), np.full(N, DETECT))
         assert np.all((p_visible > 0) & (p_visible < 1))
         assert np.all((marginal(p_visible, GROUP) > 0) & (marginal(p_visible, GROUP) < 1))
 
@@ -79,7 +77,7 @@ def test_probabilities_stay_between_0_and_1(p_visible, outcomes):
 def after(outcomes: list[list[int]]) -> Array:
     p_visible = np.full(N + GROUPS, 0.95)
     for assigned in outcomes:
-        p_visible = predict(update(p_visible, GROUP, np.array(assigned), DETECT), N)
+        p_visible = predict(update(p_visible, GROUP, np.array(assigned), np.full(N, DETECT)), N)
     return p_visible
 
 
@@ -110,7 +108,7 @@ def test_a_spot_missed_while_its_neighbours_are_found_is_occluded_but_not_its_sc
 def test_a_screen_that_reappears_gives_no_information_about_the_other():
     all_occluded = [[MISSED] * 5] * 4
     p_visible = after([[0] * 5] * 3 + all_occluded)
-    seen = update(p_visible, GROUP, np.array([0, 0, 0, NOT_LOOKED_FOR, NOT_LOOKED_FOR]), DETECT)
+    seen = update(p_visible, GROUP, np.array([0, 0, 0, NOT_LOOKED_FOR, NOT_LOOKED_FOR]), np.full(N, DETECT))
     assert seen[N] > 0.99
     assert seen[N + 1] == pytest.approx(p_visible[N + 1])
     np.testing.assert_array_equal(seen[3:N], p_visible[3:N])

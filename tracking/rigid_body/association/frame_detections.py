@@ -17,6 +17,7 @@ from geometry.compiled_projection import Views, inside, project_view
 from geometry.forward_model import SpotModel
 from geometry.rig import Rig
 from tracking.rigid_body.models.information import inverse_2x2
+from tracking.rigid_body.models.occlusion import joint_log_likelihood
 
 NOT_SEARCHED = -2  # the camera has no picture, or the spot is not expected in it; see also occlusion.MISSED
 # Added to the row of a detection that has merged with a neighbour: it is labelled but excluded from the pose.
@@ -159,27 +160,33 @@ def is_blended(frame: FrameDetections, view: int, d: int) -> bool:
 
 
 @compiled
-def detection_log_likelihood(obs: Observation, p_unoccluded: Array, assigned: Ints, R: Array, t: Array) -> float:
-    """Log-likelihood of an assignment (n,) at a pose without its Gaussian terms: detections, misses, blends.
-
-    Counts the spots that are labelled and those that the pose projects into a picture. p_unoccluded (n,): marginal
-    probability that each spot is not occluded.
-    """
-    frame, view_table, detection_model = obs.frame, obs.view_table, obs.detection_model
+def in_picture(obs: Observation, assigned: Ints, R: Array, t: Array) -> Array:
+    """(n,): 1 for the views that an assignment (n,) labels or that a pose projects into a picture, else 0."""
     uv, J = np.empty(2), np.empty((2, 6))
-    total = 0.0
+    out = np.zeros(assigned.shape[0])
     for i in range(assigned.shape[0]):
-        if not frame.has_image[view_table.camera[i]]:
-            continue
-        p = detection_model.p_detect * p_unoccluded[i]
+        shown = obs.frame.has_image[obs.view_table.camera[i]] and project_view(obs.views, i, R, t, uv, J)
+        if assigned[i] >= 0 or (shown and inside(uv, obs.view_table.size[i])):
+            out[i] = 1.0
+    return out
+
+
+@compiled
+def detection_log_likelihood(obs: Observation, p_visible: Array, assigned: Ints, p_in: Array) -> float:
+    """Log-likelihood of an assignment (n,) without its Gaussian terms: detections, misses, blends.
+
+    p_visible (n + groups,): as in models/occlusion.py. p_in (n,): probability that each spot that was not found is in
+    the picture; 1 for the others, since the Gaussian of their place says so.
+    """
+    frame, detection_model = obs.frame, obs.detection_model
+    total = joint_log_likelihood(p_visible, obs.view_table.group, assigned, detection_model.p_detect * p_in)
+    for i in range(assigned.shape[0]):
         if assigned[i] >= 0:
             d = assigned[i] % BLENDED
-            total += np.log(p) - log_false_density(frame, i, d)
+            total -= log_false_density(frame, i, d)
             if assigned[i] >= BLENDED:
                 r = frame.blend_px[d]
                 total += np.log(detection_model.p_blend / (np.pi * r * r)) if r > 0.0 else -np.inf
-        elif project_view(obs.views, i, R, t, uv, J) and inside(uv, view_table.size[i]):
-            total += np.log(1.0 - p)
     return total
 
 

@@ -50,14 +50,13 @@ class _Beam(NamedTuple):
     P: Array  # (b, 6, 6)
     assigned: Ints  # (b, n)
     score: Array  # (b,) nats
-    counted: Array  # (b,) nats: the score without its Gaussian terms
+    p_in: Array  # (b, n): probability that each spot that was not found is in the picture; 1 for those found
 
 
 class _Candidates(NamedTuple):
     """Room for b extensions of partial assignments by the decision on one view."""
 
     score: Array  # (b,)
-    counted: Array  # (b,)
     node: Ints  # (b,) the extended partial assignment
     choice: Ints  # (b,) the decision: a row, that plus BLENDED, MISSED or NOT_SEARCHED
 
@@ -68,6 +67,7 @@ class _Predictions(NamedTuple):
     uv: Array  # (b, 2)
     J: Array  # (b, 2, 6)
     cov: Array  # (b, 3)
+    p_in: Array  # (b,): probability that the spot is in the picture
 
 
 @compiled
@@ -77,17 +77,17 @@ def associate(
     """Assignments of a frame's detections to spots, best first, from a predicted pose (R, t) with its P (6, 6).
 
     p_unoccluded (n,): marginal probability that each spot is not occluded. Returns b assignments (b, n); their
-    scores (b,), nats, and these without the Gaussian terms (b,); the poses R (b, 3, 3) and t (b, 3) that they lead to;
-    and b.
+    scores (b,), nats; their p_in (b, n) for `detection_log_likelihood`; the poses R (b, 3, 3) and t (b, 3) that they
+    lead to; and b.
     """
     n = obs.view_table.camera.shape[0]
     width = _beam_width(obs, R, t, P)
     beam, next_beam = _empty_beam(width, n), _empty_beam(width, n)
-    predictions = _Predictions(np.empty((width, 2)), np.empty((width, 2, 6)), np.empty((width, 3)))
-    candidates = _Candidates(np.empty(width), np.empty(width), np.empty(width, np.int64), np.empty(width, np.int64))
-    beam.score[0] = beam.counted[0] = 0.0
+    predictions = _Predictions(np.empty((width, 2)), np.empty((width, 2, 6)), np.empty((width, 3)), np.empty(width))
+    candidates = _Candidates(np.empty(width), np.empty(width, np.int64), np.empty(width, np.int64))
+    beam.score[0] = 0.0
     for i in range(n):
-        beam.assigned[0, i] = NOT_SEARCHED
+        beam.assigned[0, i], beam.p_in[0, i] = NOT_SEARCHED, 0.0
     _copy_pose(beam, 0, R, t, P)
     count = 1
     undecided = np.empty(n, dtype=np.bool_)
@@ -104,7 +104,7 @@ def associate(
             found, worst = _extend(obs, beam, node, view, p_unoccluded[view], predictions, candidates, found, worst)
         count = _select(obs, beam, view, predictions, candidates, found, next_beam)
         beam, next_beam = next_beam, beam
-    return beam.assigned[:count], beam.score[:count], beam.counted[:count], beam.R[:count], beam.t[:count], count
+    return beam.assigned[:count], beam.score[:count], beam.p_in[:count], beam.R[:count], beam.t[:count], count
 
 
 @compiled_in_caller
@@ -129,7 +129,7 @@ def _empty_beam(b: int, n: int) -> _Beam:
         np.empty((b, 6, 6)),
         np.empty((b, n), np.int64),
         np.empty(b),
-        np.empty(b),
+        np.empty((b, n)),
     )
 
 
@@ -190,7 +190,7 @@ def _extend(
     """
     frame, calibration_cov = obs.frame, obs.calibration_cov
     uv, J = predictions.uv[node], predictions.J[node]
-    score, counted = beam.score[node], beam.counted[node]
+    score = beam.score[node]
     projected, a, b, c = predicted_pixel(obs.views, view, beam.R[node], beam.t[node], beam.P[node], uv, J)
     predictions.cov[node, 0], predictions.cov[node, 1], predictions.cov[node, 2] = a, b, c
     p_in = 0.0
@@ -202,11 +202,11 @@ def _extend(
             c + calibration_cov[view, 1, 1] + curvature,
         )
         p_in = p_in_picture(uv[0], uv[1], a, c, obs.view_table.size[view, 0], obs.view_table.size[view, 1])
+    predictions.p_in[node] = p_in
     if p_in < MIN_P_IN_PICTURE:
-        return _insert(candidates, count, worst, score, counted, node, NOT_SEARCHED)
-    p_detect = obs.detection_model.p_detect * p_unoccluded * p_in
-    gain = np.log(1.0 - p_detect)
-    count, worst = _insert(candidates, count, worst, score + gain, counted + gain, node, MISSED)
+        return _insert(candidates, count, worst, score, node, NOT_SEARCHED)
+    p_detect = obs.detection_model.p_detect * p_unoccluded
+    count, worst = _insert(candidates, count, worst, score + np.log(1.0 - p_detect * p_in), node, MISSED)
     log_p_detect = np.log(p_detect)
     camera = obs.view_table.camera[view]
     for d in range(frame.first[camera], frame.first[camera + 1]):
@@ -222,14 +222,12 @@ def _extend(
         chi2 = y0 * (sa * y0 + sb * y1) + y1 * (sb * y0 + sc * y1)
         if chi2 < GATE_CHI2:
             likelihood = score + gain - 0.5 * chi2 - 0.5 * np.log(det) - LOG_2PI
-            count, worst = _insert(candidates, count, worst, likelihood, counted + gain, node, d)
+            count, worst = _insert(candidates, count, worst, likelihood, node, d)
         else:
             r = frame.blend_px[d] if is_blended(frame, view, d) else 0.0
             if r > 0.0 and distance2 < (r + 2 * np.sqrt(max(a, c))) ** 2 and a + c < r * r:
                 log_blend = np.log(obs.detection_model.p_blend / (np.pi * r * r))
-                count, worst = _insert(
-                    candidates, count, worst, score + gain + log_blend, counted + gain + log_blend, node, d + BLENDED
-                )
+                count, worst = _insert(candidates, count, worst, score + gain + log_blend, node, d + BLENDED)
     return count, worst
 
 
@@ -245,7 +243,7 @@ def is_taken(assigned: Ints, d: int) -> bool:
 
 @compiled
 def _insert(
-    candidates: _Candidates, count: int, worst: float, score: float, counted: float, node: int, choice: int
+    candidates: _Candidates, count: int, worst: float, score: float, node: int, choice: int
 ) -> tuple[int, float]:
     """Add a candidate; where there is no room it replaces the worst, unless it is worse itself.
 
@@ -262,8 +260,7 @@ def _insert(
         for k in range(room):
             if candidates.score[k] < candidates.score[place]:
                 place = k
-    candidates.score[place], candidates.counted[place] = score, counted
-    candidates.node[place], candidates.choice[place] = node, choice
+    candidates.score[place], candidates.node[place], candidates.choice[place] = score, node, choice
     if count == room:
         worst = candidates.score[0]
         for k in range(room):
@@ -291,11 +288,13 @@ def _select(
             break
         node, choice = candidates.node[k], candidates.choice[k]
         copy_into(next_beam.assigned[kept], beam.assigned[node])
+        copy_into(next_beam.p_in[kept], beam.p_in[node])
         next_beam.assigned[kept, view] = choice
+        next_beam.p_in[kept, view] = 1.0 if choice >= 0 else predictions.p_in[node] if choice == MISSED else 0.0
         _copy_pose(next_beam, kept, beam.R[node], beam.t[node], beam.P[node])
         if 0 <= choice < BLENDED:
             _update_pose(obs, view, choice, predictions, node, next_beam.R[kept], next_beam.t[kept], next_beam.P[kept])
-        next_beam.score[kept], next_beam.counted[kept] = candidates.score[k], candidates.counted[k]
+        next_beam.score[kept] = candidates.score[k]
         kept += 1
     return kept
 

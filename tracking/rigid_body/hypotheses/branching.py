@@ -19,6 +19,7 @@ from tracking.rigid_body.association.frame_detections import (
     BLENDED,
     Observation,
     detection_log_likelihood,
+    in_picture,
     log_clutter_ratio,
 )
 from tracking.rigid_body.association.joint_search import associate, complete, explainable, is_taken
@@ -40,7 +41,7 @@ from tracking.rigid_body.hypotheses.hypothesis_set import (
     largest_spot_sigma,
 )
 from tracking.rigid_body.models.motion import predicted
-from tracking.rigid_body.models.occlusion import MISSED, joint_log_likelihood, marginal, predict, update
+from tracking.rigid_body.models.occlusion import MISSED, marginal, predict, update
 
 MANOEUVRE_PRUNE_NATS = 6.0  # a hypothesis that is this much less likely than the best is not tried with a manoeuvre
 MAX_COMPLETED = 8  # assignments of one prediction that are completed after their update
@@ -57,7 +58,7 @@ class _Assignments(NamedTuple):
 
     assigned: Ints  # (c, n)
     score: Array  # (c,) nats
-    counted: Array  # (c,) nats
+    p_in: Array  # (c, n)
     R: Array  # (c, 3, 3)
     t: Array  # (c, 3)
 
@@ -167,7 +168,8 @@ def _branch_motion(
         if mixes and MIN_CONFIRMING_SPOTS <= labelled < MIN_REDUNDANT_SPOTS:
             prior = _with_either_motion(step, h, expected, sudden)
         state = _state_if_determined(obs, prior, result, assigned[k], labelled)
-        log_weight = _log_weight(obs, log_prior + found.counted[k] + log_likelihood, p_visible, assigned[k], state)
+        log_weight = log_prior + log_likelihood + log_clutter_ratio(obs, state.R, state.t, state.P)
+        log_weight += detection_log_likelihood(obs, p_visible, assigned[k], found.p_in[k])
         if mixes and log_weight >= likeliest and old.log_weight[h] > -MANOEUVRE_PRUNE_NATS:
             likeliest, dof = log_weight, 2 * result.spots
             suspected = (
@@ -178,7 +180,7 @@ def _branch_motion(
             )
         if np.isfinite(log_weight):
             best = max(best, log_weight)
-            after = update(p_visible, group, assigned[k], obs.detection_model.p_detect)
+            after = update(p_visible, group, assigned[k], obs.detection_model.p_detect * found.p_in[k])
             count, _ = add_child(children, count, state, log_weight, after, assigned[k], manoeuvre, h)
     return count, best, suspected
 
@@ -186,14 +188,15 @@ def _branch_motion(
 @compiled_in_caller
 def _assignments(obs: Observation, predicted: State, p_unoccluded: Array) -> tuple[_Assignments, int]:
     """The assignments of a joint search from a predicted state, with room for completed ones, and their number."""
-    assigned, score, counted, R, t, b = associate(obs, predicted.R, predicted.t, block(predicted.P, 6), p_unoccluded)
+    assigned, score, p_in, R, t, b = associate(obs, predicted.R, predicted.t, block(predicted.P, 6), p_unoccluded)
     n, room = assigned.shape[1], b + MAX_COMPLETED
     out = _Assignments(
-        np.empty((room, n), np.int64), np.empty(room), np.empty(room), np.empty((room, 3, 3)), np.empty((room, 3))
+        np.empty((room, n), np.int64), np.empty(room), np.empty((room, n)), np.empty((room, 3, 3)), np.empty((room, 3))
     )
     for k in range(b):
         copy_into(out.assigned[k], assigned[k])
-        out.score[k], out.counted[k] = score[k], counted[k]
+        out.score[k] = score[k]
+        copy_into(out.p_in[k], p_in[k])
         copy_matrix_into(out.R[k], R[k])
         copy_into(out.t[k], t[k])
     return out, b
@@ -221,7 +224,7 @@ def _add_completed(obs: Observation, of: _Assignments, k: int, b: int, state: St
     of.score[place] = np.inf  # its exact update decides, not the linearised search
     if place < b:
         return b
-    of.counted[b] = detection_log_likelihood(obs, p_unoccluded, new, state.R, state.t)
+    copy_into(of.p_in[b], in_picture(obs, new, state.R, state.t))
     copy_matrix_into(of.R[b], state.R)
     copy_into(of.t[b], state.t)
     return b + 1
@@ -246,13 +249,6 @@ def _state_if_determined(obs: Observation, prior: State, result: Update, assigne
     ):
         return prior
     return result.state
-
-
-@compiled
-def _log_weight(obs: Observation, log_weight: float, p_visible: Array, assigned: Ints, state: State) -> float:
-    """A child's log-weight with the terms for common occlusion and for the concentration of clutter near spots."""
-    log_weight += joint_log_likelihood(p_visible, obs.view_table.group, assigned, obs.detection_model.p_detect)
-    return log_weight + log_clutter_ratio(obs, state.R, state.t, state.P)
 
 
 @compiled

@@ -45,33 +45,24 @@ def marginal(p_visible: Array, group: Ints) -> Array:
 
 
 @compiled
-def joint_log_likelihood(p_visible: Array, group: Ints, assigned: Ints, p_detect: float) -> float:
-    """Correction of an assignment's log-likelihood, nats, for the common occlusion of each screen's spots.
+def joint_log_likelihood(p_visible: Array, group: Ints, assigned: Ints, p_detect: Array) -> float:
+    """Log-likelihood of an assignment's detections and misses, nats, with the common occlusion of each screen's spots.
 
-    The joint log-likelihood of detections and misses less the sum of the marginal ones, which the joint search adds up.
-    assigned (n,): as in association; p_detect: probability of detection of a visible spot.
+    assigned (n,): as in association; p_detect (n,): probability of detection of each spot if it is visible.
     """
     n = group.shape[0]
-    joint_sum = marginal_sum = 0.0
+    joint_sum = 0.0
     for g in range(p_visible.shape[0] - n):
         p_screen = p_visible[n + g]
-        joint, product, none = 1.0, 1.0, True
+        joint, none = 1.0, True
         for i in range(n):
             if group[i] != g or assigned[i] < MISSED:
                 continue
-            p = p_detect * p_visible[i]
-            if assigned[i] >= 0:
-                none = False
-                joint *= p
-                product *= p * p_screen
-            else:
-                joint *= 1 - p
-                product *= 1 - p * p_screen
+            p = p_detect[i] * p_visible[i]
+            none = none and assigned[i] < 0
+            joint *= p if assigned[i] >= 0 else 1 - p
         joint_sum += np.log(p_screen * joint + (1 - p_screen if none else 0.0))
-        marginal_sum += np.log(product)
-    if _nothing_found(assigned):
-        joint_sum = np.log(np.exp(joint_sum) + P_BLACKOUT)
-    return joint_sum - marginal_sum
+    return np.log(np.exp(joint_sum) + P_BLACKOUT) if _nothing_found(assigned) else joint_sum
 
 
 @compiled
@@ -86,8 +77,11 @@ def _nothing_found(assigned: Ints) -> bool:
 
 
 @compiled
-def update(p_visible: Array, group: Ints, assigned: Ints, p_detect: float) -> Array:
-    """Posterior probabilities (n + groups,) after a frame with this assignment (n,): Bayes' rule."""
+def update(p_visible: Array, group: Ints, assigned: Ints, p_detect: Array) -> Array:
+    """Posterior probabilities (n + groups,) after a frame with this assignment (n,): Bayes' rule.
+
+    p_detect (n,): as in `joint_log_likelihood`.
+    """
     n = group.shape[0]
     out = p_visible.copy()
     p_blackout = P_BLACKOUT if _nothing_found(assigned) else 0.0
@@ -98,7 +92,7 @@ def update(p_visible: Array, group: Ints, assigned: Ints, p_detect: float) -> Ar
             if group[i] == g and assigned[i] >= MISSED:
                 searched = True
                 none = none and assigned[i] < 0
-                joint *= p_detect * p_visible[i] if assigned[i] >= 0 else 1 - p_detect * p_visible[i]
+                joint *= p_detect[i] * p_visible[i] if assigned[i] >= 0 else 1 - p_detect[i] * p_visible[i]
         after = 1.0
         if none and searched:
             after = p_screen * joint / (p_screen * joint + 1 - p_screen + p_blackout)
@@ -112,5 +106,6 @@ def update(p_visible: Array, group: Ints, assigned: Ints, p_detect: float) -> Ar
             if assigned[i] >= 0:
                 out[i] = 1 - 1e-6
             else:  # missed although the screen is visible, or no information because the screen is occluded
-                out[i] = after * p * (1 - p_detect) / (p * (1 - p_detect) + 1 - p) + (1 - after) * p
+                unseen = p * (1 - p_detect[i])
+                out[i] = after * unseen / (unseen + 1 - p) + (1 - after) * p
     return out

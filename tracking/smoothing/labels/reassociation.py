@@ -26,13 +26,14 @@ from tracking.rigid_body.association.frame_detections import (
     ViewTable,
     chosen_points,
     detection_log_likelihood,
+    in_picture,
     predicted_pixel,
 )
 from tracking.rigid_body.association.joint_search import associate
 from tracking.rigid_body.hypotheses.hypothesis_set import State, iterated_update
 from tracking.rigid_body.models.information import frame_information, single_frame_pose
 from tracking.rigid_body.models.motion import STATE
-from tracking.rigid_body.models.occlusion import joint_log_likelihood, marginal
+from tracking.rigid_body.models.occlusion import marginal
 from tracking.rigid_body.online_estimates import PicturePoints, no_places, static_log_density, update_places
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
 
@@ -311,13 +312,8 @@ def _widened(case: _Case, P: Array, sigma: Array) -> State:
 @compiled
 def _score(case: _Case, log_prior: float, log_likelihood: float, assigned: Ints, R: Array, t: Array) -> float:
     """Log-likelihood of an assignment (n,) with its Gaussian part, at a pose, nats."""
-    obs = case.obs
-    return (
-        log_prior
-        + log_likelihood
-        + detection_log_likelihood(obs, case.p_unoccluded, assigned, R, t)
-        + joint_log_likelihood(case.p_visible, obs.view_table.group, assigned, obs.detection_model.p_detect)
-    )
+    p_in = in_picture(case.obs, assigned, R, t)
+    return log_prior + log_likelihood + detection_log_likelihood(case.obs, case.p_visible, assigned, p_in)
 
 
 @compiled
