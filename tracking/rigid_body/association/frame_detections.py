@@ -175,8 +175,9 @@ def in_picture(obs: Observation, assigned: Ints, R: Array, t: Array) -> Array:
 def detection_log_likelihood(obs: Observation, p_visible: Array, assigned: Ints, p_in: Array) -> float:
     """Log-likelihood of an assignment (n,) without its Gaussian terms: detections, misses, blends.
 
-    p_visible (n + groups,): as in models/occlusion.py. p_in (n,): probability that each spot that was not found is in
-    the picture; 1 for the others, since the Gaussian of their place says so.
+    p_visible (n + groups,): as in models/occlusion.py. p_in (n,): probability that each spot is in the picture. It
+    counts for the spots that are found as well: the more of a prediction lies outside, the less its Gaussian means.
+    Without it three false points were followed while all spots were hidden.
     """
     frame, detection_model = obs.frame, obs.detection_model
     total = joint_log_likelihood(p_visible, obs.view_table.group, assigned, detection_model.p_detect * p_in)

@@ -50,7 +50,7 @@ class _Beam(NamedTuple):
     P: Array  # (b, 6, 6)
     assigned: Ints  # (b, n)
     score: Array  # (b,) nats
-    p_in: Array  # (b, n): probability that each spot that was not found is in the picture; 1 for those found
+    p_in: Array  # (b, n): probability that each spot is in the picture
 
 
 class _Candidates(NamedTuple):
@@ -205,8 +205,8 @@ def _extend(
     predictions.p_in[node] = p_in
     if p_in < MIN_P_IN_PICTURE:
         return _insert(candidates, count, worst, score, node, NOT_SEARCHED)
-    p_detect = obs.detection_model.p_detect * p_unoccluded
-    count, worst = _insert(candidates, count, worst, score + np.log(1.0 - p_detect * p_in), node, MISSED)
+    p_detect = obs.detection_model.p_detect * p_unoccluded * p_in
+    count, worst = _insert(candidates, count, worst, score + np.log(1.0 - p_detect), node, MISSED)
     log_p_detect = np.log(p_detect)
     camera = obs.view_table.camera[view]
     for d in range(frame.first[camera], frame.first[camera + 1]):
@@ -290,7 +290,7 @@ def _select(
         copy_into(next_beam.assigned[kept], beam.assigned[node])
         copy_into(next_beam.p_in[kept], beam.p_in[node])
         next_beam.assigned[kept, view] = choice
-        next_beam.p_in[kept, view] = 1.0 if choice >= 0 else predictions.p_in[node] if choice == MISSED else 0.0
+        next_beam.p_in[kept, view] = predictions.p_in[node] if choice >= MISSED else 0.0
         _copy_pose(next_beam, kept, beam.R[node], beam.t[node], beam.P[node])
         if 0 <= choice < BLENDED:
             _update_pose(obs, view, choice, predictions, node, next_beam.R[kept], next_beam.t[kept], next_beam.P[kept])
