@@ -13,13 +13,7 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from tracking.rigid_body.online_estimates import MANOEUVRE_S
-from tracking.smoothing.motion.fixed_interval import (
-    Interval,
-    RunInformation,
-    log_likelihood,
-    motion_cost,
-    smoothed,
-)
+from tracking.smoothing.motion.fixed_interval import Interval, RunInformation, log_likelihood, motion_cost, smoothed
 from tracking.smoothing.motion.interpolation import Interpolation, extrapolated
 from tracking.smoothing.motion.process_noise import (
     corner_offsets,
