@@ -25,13 +25,7 @@ from tracking.binocular.joint_fit import (
     triangulate,
     undistorted_pixels,
 )
-from tracking.binocular.marker_model import (
-    MarkerModel,
-    SegmentationParameters,
-    StereoPair,
-    project,
-    project_markers,
-)
+from tracking.binocular.marker_model import MarkerModel, SegmentationParameters, StereoPair, project, project_markers
 from tracking.binocular.segmentation import ColourRange, marker_candidates, prepared
 from tracking.learned_detector.detector import find_drogues
 

@@ -22,14 +22,7 @@ from geometry.arrays import Array, Ints
 from geometry.camera import in_picture
 from geometry.pose import Pose
 from lab.targets.stereo.simulated_recording import drogue_markers, simulated_pair
-from studies.zhou2020 import (
-    BASELINE_M,
-    FOCAL_PX,
-    METHODS,
-    SIZE_PX,
-    distance_errors,
-    pose_errors,
-)
+from studies.zhou2020 import BASELINE_M, FOCAL_PX, METHODS, SIZE_PX, distance_errors, pose_errors
 from tracking.binocular.joint_fit import MarkerObservations, fit_pose
 from tracking.binocular.marker_model import StereoPair, project, project_markers
 

@@ -36,13 +36,7 @@ from lab.pictures.picture_file import DROPPED, UNREADABLE, MissingPicture
 from lab.pictures.source import PictureFiles
 from lab.progress import Progress
 from lab.runs.frames.frames import FrameReader, open_frames, pictures_at
-from lab.runs.setup_check import (
-    SampledFrames,
-    mistakes_by_themselves,
-    points_in,
-    rates_of_videos,
-    recorded_mistakes,
-)
+from lab.runs.setup_check import SampledFrames, mistakes_by_themselves, points_in, rates_of_videos, recorded_mistakes
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
 from tracking.setup_mistakes.evidence import ENOUGH, NAMES, Invisible, invisible_mistakes

@@ -43,7 +43,6 @@ class ErrorScale:
 
     misfit_share: Array  # (cameras,) least error by misfits of the fits (speckle, texture), as a share of the widths
     width_share: Array  # (cameras,) errors beyond the stated ones, as a share of the spots' widths (1 sigma)
-    noise_scale: float  # ratio of the errors to the stated sigmas beyond these
     factors: VarianceFactors  # of the parts of the stated variances
 
     @staticmethod
@@ -80,8 +79,7 @@ class ErrorScale:
         # A vehicle at rest has few residuals that are independent of each other.
         usual = max(DEADBAND, 1 + 3 * np.sqrt(2 / max(factors.freedom, 1e-9)))
         more = width_share(views, wider, assigned, calibration_cov, ref, measured, usual)
-        scale = noise_scale(views, widened(wider, more), assigned, calibration_cov, ref, measured, usual)
-        return ErrorScale(misfit, np.hypot(seen, more), scale, factors)
+        return ErrorScale(misfit, np.hypot(seen, more), factors)
 
     def covariance(self, stated: Array, width_px: Array, place_px2: Array, camera: Ints | int) -> Array:
         """Covariances (m, 2, 2), px^2, of spots with these widths (m,), px, and stated covariances (m, 2, 2).
@@ -90,15 +88,15 @@ class ErrorScale:
         """
         least = _least_variance(place_px2, width_px, self.misfit_share[camera])
         within = _within(self.factors, _with_more(stated, least), place_px2, least, camera)
-        return _with_more(within, _variance_of_share(width_px, self.width_share[camera])) * self.noise_scale**2
+        return _with_more(within, _variance_of_share(width_px, self.width_share[camera]))
 
     def place_px2(self, run: RunDetections, stated_px2: Array) -> Array:
         """(m,): variances of a run's detections that belong to their places."""
         camera = _cameras_of(run)
         least = _least_variance(stated_px2, run.size_px, self.misfit_share[camera])
         place = stated_px2 * self.factors.place[camera] + least * self.factors.misfit[camera]
-        place += _variance_of_share(run.size_px, self.width_share[camera])  # speckle and texture that were not stated
-        return np.asarray(place * self.noise_scale**2)
+        # Speckle and texture that were not stated belong to places, too.
+        return np.asarray(place + _variance_of_share(run.size_px, self.width_share[camera]))
 
     def of_run(self, run: RunDetections, place_px2: Array) -> Array:
         """Covariances (m, 2, 2) of all detections of a run."""
@@ -180,13 +178,12 @@ def widened(detections: RunDetections, share: Array | float) -> RunDetections:
 
 def width_share(
     views: Views, detections: RunDetections, assigned: Ints, calibration_cov: Array, ref: Reference, measured: Bools,
-    usual: float = DEADBAND,
+    usual: float,
 ) -> float:  # fmt: skip
     """Errors beyond the stated ones as a share of the spots' widths (1 sigma); 0 if the stated sigmas are correct.
 
     Also 0 up to a `usual` variance factor, and if no width is known. Texture and speckle shift a spot in proportion to
-    its width, whatever its noise is: if the residuals are larger than stated, such errors are added before all sigmas
-    are scaled (`noise_scale`).
+    its width, whatever its noise is: if the residuals are larger than stated, such errors are added.
     """
     if not np.isfinite(detections.size_px).any():
         return 0.0
@@ -259,15 +256,6 @@ def _share_with(variance_factor: Callable[[float], float]) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if variance_factor(middle) > 1.0 else (low, middle)
     return 0.5 * (low + high)
-
-
-def noise_scale(
-    views: Views, detections: RunDetections, assigned: Ints, calibration_cov: Array, ref: Reference, measured: Bools,
-    usual: float = DEADBAND,
-) -> float:  # fmt: skip
-    """Ratio of the spots' errors to their stated sigmas; 1 up to a `usual` variance factor."""
-    mean = _mean_variance_factor(views, detections, assigned, calibration_cov, ref, np.flatnonzero(measured))
-    return float(np.sqrt(mean)) if mean > usual else 1.0
 
 
 def _mean_variance_factor(

@@ -29,12 +29,7 @@ from lab.findings.finding import Finding, Level, entries, finding, passed
 from lab.number_format import format_cell, format_count, format_number, format_some, format_vector
 from lab.report.calibration.calibration_drawings import coverage_map, residual_field, residual_histogram
 from lab.report.calibration.calibration_scene import rig_things, scene_views
-from lab.report.page import (
-    KeyFigure,
-    PageDrawing,
-    PageTable,
-    Section,
-)
+from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
 
 
 def diagnose_failed_fit(

@@ -27,12 +27,7 @@ from lab.report.calibration.calibration_drawings import (
     residual_histogram,
     tilt_polar,
 )
-from lab.report.page import (
-    KeyFigure,
-    PageDrawing,
-    PageTable,
-    Section,
-)
+from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
 from lab.report.plot.maps import heat_map
 
 _ENOUGH_VIEWS, _FEWEST_MORE = 15, 5  # photographs in all, and at least to add

@@ -29,15 +29,7 @@ from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import fit_pose
 from geometry.rig import Rig
-from geometry.uncertainty.rig_uncertainty import (
-    BOW,
-    CLOCK,
-    POSE,
-    RigCovariance,
-    Sensitivity,
-    camera_column,
-    split_name,
-)
+from geometry.uncertainty.rig_uncertainty import BOW, CLOCK, POSE, RigCovariance, Sensitivity, camera_column, split_name
 from lab.calibrate.drift_check.drift_inputs import KnownPoints, StillSpots, check_points_match
 from lab.errors import InputError
 from lab.files.text.csv_text import read_table, write_table

@@ -27,12 +27,7 @@ from lab.report.calibration.calibration_drawings import (
     residual_histogram,
 )
 from lab.report.calibration.calibration_scene import rig_things, scene_views
-from lab.report.page import (
-    KeyFigure,
-    PageDrawing,
-    PageTable,
-    Section,
-)
+from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
 
 _MISFIT = "BP-R02"  # its variants: the kinds of measurements
 

@@ -25,12 +25,7 @@ from lab.findings.finding import Finding, Level, finding, level_above, passed
 from lab.number_format import format_count, format_number, format_vector
 from lab.report.calibration.calibration_drawings import corners_overlay, correlation_matrix, flatness_map
 from lab.report.calibration.calibration_scene import LAB_VIEWS, Marker, Rectangle, SceneObject, frustum_of, scene_views
-from lab.report.page import (
-    KeyFigure,
-    PageDrawing,
-    PageTable,
-    Section,
-)
+from lab.report.page import KeyFigure, PageDrawing, PageTable, Section
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,13 +14,7 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.uncertainty.rig_uncertainty import RigCovariance, camera_names
 from lab.errors import InputError
-from lab.files.rig.camera_file import (
-    CalibrationState,
-    CovarianceBlock,
-    LensBlock,
-    covariance_mapping,
-    lens_mapping,
-)
+from lab.files.rig.camera_file import CalibrationState, CovarianceBlock, LensBlock, covariance_mapping, lens_mapping
 from lab.files.rig.interchange import BEAMPOSE, RIG, read_cameras, recognised_format
 from lab.files.rig.pose_block import CameraPoseBlock, pose_mapping
 from lab.files.rig.rig_file import joint_covariance, load_rig_file

@@ -16,14 +16,7 @@ from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import pixel_covariance
 from geometry.uncertainty.rig_uncertainty import beam_image, scatter, uncertainty_tracks, unlimited
 from lab.errors import BeamposeError, InputError
-from lab.files.run.results import (
-    POSE_STATUSES,
-    SPOT_STATUSES,
-    PoseTrack,
-    ResultFolder,
-    SpotGrid,
-    read_result_table,
-)
+from lab.files.run.results import POSE_STATUSES, SPOT_STATUSES, PoseTrack, ResultFolder, SpotGrid, read_result_table
 from lab.files.run.run_file import FramesFolder, Run, VideoFile
 from lab.number_format import decimals_of
 from lab.pictures.picture_file import GreyPicture, MissingPicture

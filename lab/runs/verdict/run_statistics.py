@@ -22,13 +22,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from lab.files.run.results import ListedEvent
 from lab.number_format import format_count
 from lab.runs.frames.pipeline import FrameRecord, Pair
-from tracking.consistency import (
-    SpotAgreement,
-    against_causal,
-    against_own_spots,
-    contradictory,
-    is_covariance,
-)
+from tracking.consistency import SpotAgreement, against_causal, against_own_spots, contradictory, is_covariance
 from tracking.detections import UNMATCHED
 from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame, Word
 

@@ -23,15 +23,7 @@ from geometry.pose import Pose
 from geometry.rig import Rig
 from lab.calibrate.screens.screen_page import near_findings, network_findings
 from lab.findings.finding import Level
-from tests.calibration.screens.networks import (
-    corners_of,
-    fixed_to,
-    lab,
-    look_at,
-    lying_on,
-    measured,
-    without_dots,
-)
+from tests.calibration.screens.networks import corners_of, fixed_to, lab, look_at, lying_on, measured, without_dots
 
 PLAIN = [ScreenSetup(), ScreenSetup()]
 POSE = ("x_m", "y_m", "z_m", "rot_x_rad", "rot_y_rad", "rot_z_rad")

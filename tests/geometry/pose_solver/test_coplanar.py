@@ -12,12 +12,7 @@ from geometry.arrays import Array, normalised
 from geometry.forward_model import SpotModel
 from geometry.planes import intersect_plane, screen_to_world
 from geometry.pose import Pose
-from geometry.pose_solver.closed_form import (
-    meeting_point,
-    middle_spot,
-    outer_spot,
-    quadratic_coefficients,
-)
+from geometry.pose_solver.closed_form import meeting_point, middle_spot, outer_spot, quadratic_coefficients
 from geometry.rig import Beam, Rig, Screen
 from tests.geometry.scenes import LENSES, camera_that_looks_at, paper_rig, random_pose
 

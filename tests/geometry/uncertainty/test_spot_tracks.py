@@ -10,12 +10,7 @@ import pytest
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import pixel_covariance
-from geometry.uncertainty.rig_uncertainty import (
-    beam_image,
-    scatter,
-    uncertainty_tracks,
-    unlimited,
-)
+from geometry.uncertainty.rig_uncertainty import beam_image, scatter, uncertainty_tracks, unlimited
 from tests.lab.fake_results import fake_rig
 
 RIG = fake_rig()

@@ -8,13 +8,7 @@ import pytest
 
 from lab.findings.finding import Finding, Level, Verdict, entries, finding
 from lab.runs.frames.sensor_noise import CameraNoise
-from lab.runs.verdict.quality import (
-    GOOD_MEASURED,
-    LEAST_DISPLACED,
-    LEAST_MEASURED,
-    LEAST_MEASURED_OF_SHOWN,
-    judge,
-)
+from lab.runs.verdict.quality import GOOD_MEASURED, LEAST_DISPLACED, LEAST_MEASURED, LEAST_MEASURED_OF_SHOWN, judge
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
 
 FRAMES = 1000

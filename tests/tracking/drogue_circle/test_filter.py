@@ -9,13 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from tests.tracking.drogue_circle.discs import BLUR_PX, covered, discs, rounded
-from tracking.drogue_circle.kalman import (
-    FilterBank,
-    MotionModel,
-    motion_models,
-    printed_coefficient,
-    printed_step,
-)
+from tracking.drogue_circle.kalman import FilterBank, MotionModel, motion_models, printed_coefficient, printed_step
 from tracking.drogue_circle.occlusion import disc_cells, first_appearance
 from tracking.kalman import process_noise, propagate, transition, update
 

@@ -11,11 +11,7 @@ from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.scenarios import RIGS, PriorRegion, scaled
 from tests.tracking.rigid_runs import RIGID, assess, dt_of, found_in, prior_of, recording_of, tracked, with_occlusions
 from tracking.detections import UNMATCHED
-from tracking.rigid_body.hypotheses.hypothesis_set import (
-    MAX_TRACKING_SIGMA_PX,
-    MIN_REDUNDANT_SPOTS,
-    largest_spot_sigma,
-)
+from tracking.rigid_body.hypotheses.hypothesis_set import MAX_TRACKING_SIGMA_PX, MIN_REDUNDANT_SPOTS, largest_spot_sigma
 from tracking.rigid_body.models.motion import ANY_MOMENT, predicted
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus

@@ -115,4 +115,3 @@ def test_motion_between_pictures_that_is_better_than_stated_does_not_make_the_sp
         np.ones(frames, dtype=bool), motion,
     )  # fmt: skip
     assert errors.factors.noise == pytest.approx(np.ones(len(errors.factors.noise)), abs=0.15)
-    assert errors.noise_scale == 1.0

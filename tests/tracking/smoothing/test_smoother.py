@@ -301,7 +301,6 @@ def test_sigmas_three_times_too_small_are_corrected():
     small = replace(run, detections=tuple(tuple(replace(d, cov_px2=d.cov_px2 / 9) for d in f) for f in run.detections))
     again, smoothed = smoothed_frames(small, tracked(small))
     assert np.sqrt(smoothed.errors.factors.noise) == pytest.approx(3.0, rel=0.1)
-    assert smoothed.errors.noise_scale == 1.0
     j = assess(run, again)
     assert np.mean(j.nees) / 6 < 1.7
     assert j.missed() <= 3

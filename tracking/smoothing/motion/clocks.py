@@ -14,13 +14,7 @@ from tracking.rigid_body.models.motion import STATE
 from tracking.smoothing.motion.fixed_interval import RunInformation, smoothed
 from tracking.smoothing.motion.instants import usual_step
 from tracking.smoothing.motion.process_noise import largest_near
-from tracking.smoothing.motion.run_detections import (
-    ClockSolution,
-    Reference,
-    UnknownClocks,
-    WholeRun,
-    timed_rows,
-)
+from tracking.smoothing.motion.run_detections import ClockSolution, Reference, UnknownClocks, WholeRun, timed_rows
 
 DETERMINED = 0.3  # of the prior's sigma: a number whose sigma is larger keeps its prior
 MAX_CLOCK_STEPS = 4  # after each estimate of the motion

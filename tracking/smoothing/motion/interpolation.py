@@ -14,12 +14,7 @@ import numpy as np
 from geometry.arrays import Array, Bools
 from tracking.rigid_body.models.motion import ANY_MOMENT, STATE, predicted
 from tracking.rigid_body.online_estimates import MANOEUVRE_S
-from tracking.smoothing.motion.fixed_interval import (
-    Interval,
-    RunInformation,
-    leave_one_out_log_likelihood,
-    smoothed,
-)
+from tracking.smoothing.motion.fixed_interval import Interval, RunInformation, leave_one_out_log_likelihood, smoothed
 from tracking.smoothing.motion.run_detections import Reference
 
 OFFSETS = (-2.0, -4.0, -6.0)  # of log q: tried for the interpolation between frames

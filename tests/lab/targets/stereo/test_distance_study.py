@@ -6,13 +6,7 @@ import pytest
 from bench.related_measurements.stereo import DISTANCES_M, simulated_calibration
 from lab.targets.stereo.simulated_recording import simulated_pair
 from studies.comparison import write_comparison
-from studies.zhou2020 import (
-    BASELINE_M,
-    FOCAL_PX,
-    SIZE_PX,
-    compare_zhou2020,
-    distance_errors,
-)
+from studies.zhou2020 import BASELINE_M, FOCAL_PX, SIZE_PX, compare_zhou2020, distance_errors
 
 
 def test_the_error_of_single_points_is_the_formula_for_parallel_cameras():
