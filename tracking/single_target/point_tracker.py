@@ -7,6 +7,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from geometry.arrays import Array, Bools, symmetric
 from geometry.uncertainty.chi_square import chi2_limit
@@ -54,6 +55,10 @@ USUAL = PointParameters()
 # Source: eq. (9) of Duan (2020) for the first vector; the confirmation is ours.
 
 _MOST_TRACKS = 200  # candidate motions that are followed at once
+_LONGEST = 30  # steps of a motion that are kept while none of several stands out
+_OWN_STEPS = 8  # detections after which one of several motions can be the target's own; with 5, glitter has some
+_OWN_SIGMAS = 4.0  # by which it moves farther than the others do, in each half of its steps
+_SCENE = 3  # so many motions that move alike are a structured scene, any of which may be the target
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +78,7 @@ class CandidateTracks:
     parameters: PointParameters
     _tracks: list[tuple[Step, ...]]
     _last: list[Step]  # the detections of the last picture
+    several: bool = False  # the last picture confirmed several motions, and it stays open which one is the target's
 
     @staticmethod
     def none(parameters: PointParameters) -> CandidateTracks:
@@ -80,12 +86,12 @@ class CandidateTracks:
         return CandidateTracks(parameters, [], [])
 
     def step(
-        self, dt: float, found: Detections, cov: Array, may_start: Bools, near: Array | None = None
+        self, dt: float, found: Detections, cov: Array, may_start: Bools, near: ArrayLike | None = None
     ) -> tuple[Step, ...] | None:
         """Continue with a picture's detections; cov (n, 2, 2), px^2. Returns the steps of a confirmed motion, or None.
 
         dt: frames since the last picture. may_start (n,): detections where a motion may begin. Of several motions that
-        are confirmed, that of the foremost detections is chosen, or the one that is nearest to the place `near` (2,).
+        are confirmed, the one that is nearest to the place `near` (2,) is chosen, without one that which stands out.
         """
         p, kept = self.parameters, min(len(found), self.parameters.most_candidates)
         continued = [c for track in self._tracks if (c := self._continued(track, dt, found, cov)) is not None]
@@ -95,13 +101,17 @@ class CandidateTracks:
             for row in range(kept)
             if np.linalg.norm(found.uv_px[row] - first.x[:2]) <= p.max_speed_px * dt
         ]
-        self._tracks = (continued + started)[:_MOST_TRACKS]
-        self._last = [_first(found, cov, row) for row in np.flatnonzero(may_start[:kept]).tolist()]
-        confirmed = [track for track in self._tracks if len(track) >= p.confirm]
-        if not confirmed:
-            return None
-        if near is None:
-            return _foremost(confirmed)
+        tracks = continued + started
+        confirmed = _distinct([track for track in tracks if len(track) >= p.confirm])
+        self._tracks = (confirmed + [track for track in tracks if len(track) < p.confirm])[:_MOST_TRACKS]
+        known = {track[-1].row for track in confirmed}
+        starts = [row for row in np.flatnonzero(may_start[:kept]).tolist() if row not in known]
+        self._last = [_first(found, cov, row) for row in starts]
+        self.several = False
+        if near is None or not confirmed:
+            chosen = _standing_out(confirmed)
+            self.several = bool(confirmed) and chosen is None
+            return chosen
         return min(confirmed, key=lambda track: float(np.linalg.norm(track[-1].x[:2] - near)))
 
     def _continued(self, track: tuple[Step, ...], dt: float, found: Detections, cov: Array) -> tuple[Step, ...] | None:
@@ -112,7 +122,7 @@ class CandidateTracks:
         if row is None:
             return None
         x, P = kalman.update(x, P, found.uv_px[row], cov[row])
-        return (*track, Step(x, P, row, float(found.flux[row])))
+        return (*track[-_LONGEST:], Step(x, P, row, float(found.flux[row])))
 
 
 def nearest(x: Array, P: Array, uv_px: Array, cov_px2: Array, p_gate: float) -> tuple[int | None, float]:
@@ -136,9 +146,48 @@ def _second(first: Step, found: Detections, cov: Array, row: int, dt: float) -> 
     return Step(x, P, row, float(found.flux[row]))
 
 
-def _foremost(tracks: Sequence[tuple[Step, ...]]) -> tuple[Step, ...]:
-    """The motion whose last detection in the order of its picture comes first there: the brightest, or sharpest."""
+def _distinct(tracks: Sequence[tuple[Step, ...]]) -> list[tuple[Step, ...]]:
+    """Of motions that end in the same detection the longest; of those the slowest: the others pass several objects."""
+    out: dict[int, tuple[Step, ...]] = {}
+    for track in sorted(tracks, key=lambda t: (-len(t), float(np.linalg.norm(t[-1].x[:2] - t[0].x[:2])))):
+        out.setdefault(track[-1].row, track)
+    return list(out.values())
+
+
+def _standing_out(tracks: Sequence[tuple[Step, ...]]) -> tuple[Step, ...] | None:
+    """The motion of the target; None: there is none, or the pictures leave open which one it is.
+
+    It is the only one, or moves while the scene does not, or comes first in the order of its pictures (the brightest,
+    or sharpest): of two motions alike, not of more, which are parts of a scene.
+    """
+    if len(tracks) < 2:
+        return tracks[0] if tracks else None
+    own = sorted(((_own_sigmas(t, tracks), k) for k, t in enumerate(tracks)), reverse=True)
+    (most, best), (second, _) = own[:2]
+    if most > _OWN_SIGMAS and (len(tracks) >= _SCENE or second <= _OWN_SIGMAS):
+        return tracks[best]
+    if len(tracks) >= _SCENE or len(tracks[0]) < _OWN_STEPS:
+        return None
     return min(tracks, key=lambda t: (max(s.row for s in t), sum(s.row for s in t)))
+
+
+def _own_sigmas(track: tuple[Step, ...], tracks: Sequence[tuple[Step, ...]]) -> float:
+    """By how many sigmas a motion moves otherwise than the scene, in that half of its steps where it is less.
+
+    The scene is that of the other motions, and at rest as far as these do not show it. A detection that is joined with
+    another one from some picture on has moved in one half only.
+    """
+    steps = len(track) - 1
+    alike = [t for t in tracks if t is not track and len(t) > steps]
+    if len(track) < _OWN_STEPS or len(alike) < min(len(tracks), _SCENE) - 1:
+        return 0.0
+    places = np.array([[t[-1 - back].x[:2] for back in (steps, steps // 2, 0)] for t in (track, *alike)])
+    own, *others = np.diff(places, axis=1)  # (2, 2) each: of both halves
+    scene = np.array(others) if len(tracks) >= _SCENE else np.zeros((1, 2, 2))
+    own = own - np.median(scene, axis=0)
+    scatter_px = np.median(np.linalg.norm(scene - np.median(scene, axis=0), axis=-1), axis=0)
+    sigmas = np.sqrt(np.trace(track[-1].P[:2, :2]) + scatter_px**2)
+    return float(np.min(np.linalg.norm(own, axis=-1) / sigmas)) if own[0] @ own[1] > 0 else 0.0
 
 
 # The tracker of one target: a constant-velocity Kalman filter with gate, prediction through misses, re-acquisition.
@@ -204,6 +253,7 @@ class PointEstimate:
     nis: float  # normalised innovation squared of the detection, or of the nearest one outside the gate
     row: int  # the detection, or UNMATCHED
     sigma_a_px: float  # px/frame^2, estimated so far
+    several: bool = False  # lost: there are several motions, of which none stands out
 
 
 NOTHING = PointEstimate(
@@ -270,10 +320,11 @@ class PointTracker:
 
     def _acquire(self, found: Detections) -> PointEstimate:
         cov = self._covariances(found)
-        steps = self._candidates.step(self._waited, found, cov, self._may_start(found), self._last_px)
+        near = self.parameters.start_px if self._last_px is None else self._last_px
+        steps = self._candidates.step(self._waited, found, cov, self._may_start(found), near)
         self._waited = 0.0
         if steps is None:
-            return NOTHING
+            return replace(NOTHING, several=self._candidates.several)
         if self._area is not None:
             self._lost_log_area = self._area.mean
         self._P_shift = np.zeros((4, 2))
