@@ -4,11 +4,12 @@ python -m bench.related_measurements.second_checks occlusion SEED COUNT     coef
 python -m bench.related_measurements.second_checks empty SEED COUNT         100 frames of COUNT scenes without a target
 python -m bench.related_measurements.second_checks edges SEED COUNT         thin rims: which edge is tracked
 python -m bench.related_measurements.second_checks consistency SEED COUNT   errors of centres against their sigmas
+python -m bench.related_measurements.second_checks ensemble SEED COUNT      the same, one frame of each video
 python -m bench.related_measurements.second_checks approaches SEED COUNT    approaching drogues, by the light tracker
 python -m bench.related_measurements.second_checks detector SEED COUNT [WEIGHTS]  COUNT drogues of each scene
 python -m bench.related_measurements.second_checks third SEED COUNT [WEIGHTS]  the same with the renderer of validation
 python -m bench.related_measurements.second_checks point SEED COUNT [NAME=NUMBER]   discs by the point tracker
-python -m bench.related_measurements.second_checks first SEED COUNT         the same before structure: where tracks start
+python -m bench.related_measurements.second_checks first SEED COUNT      the same before structure: where tracks start
 """
 
 from __future__ import annotations
@@ -187,6 +188,29 @@ def consistency(seed: int, count: int) -> None:
         )
 
 
+def ensemble(seed: int, count: int) -> None:
+    """NEES / 2 of the centre and NEES of the radius in the first measured frame: one draw of each of COUNT videos."""
+    for kind in ("plain", "textured"):
+        for scene_kind in ("sky", "cloud"):
+            centre, radius = [], []
+            for n in range(count):
+                rng = np.random.default_rng(1000 * seed + n)
+                scene, look = render.background(scene_kind, rng), render.face(kind, rng)
+                circles, tracker = motion(rng, False, (30.0, 120.0)), CircleOptions(edge="outer").tracker()
+                for circle in itertools.islice(circles, 3):
+                    frame = tracker.step(render.draw(scene, look, *circle, rng))
+                    if frame.status is PoseStatus.MEASURED:
+                        away = frame.state[:3] - circle
+                        centre.append(away[:2] @ np.linalg.solve(frame.covariance[:2, :2], away[:2]) / 2)
+                        radius.append(away[2] ** 2 / frame.covariance[2, 2])
+                        break
+            print(
+                f"{kind}, {scene_kind}: {len(centre)} of {count} measured; centre NEES/2 {np.mean(centre):.2f} +-"
+                f" {len(centre) ** -0.5:.2f}, above 4.6 (1 % of correct ones) {100 * np.mean(np.array(centre) > 4.6):.1f} %,"
+                f" largest {np.max(centre):.1f}; radius NEES {np.mean(radius):.2f}"
+            )
+
+
 def approaches(seed: int, count: int) -> None:
     """Drogues that come from 9 to 120 px in 90 frames; something hides them for six of these."""
     for kind in ("cloud", "ground"):
@@ -345,6 +369,7 @@ if __name__ == "__main__":
         "third": third,
         "point": point,
         "first": first,
+        "ensemble": ensemble,
     }
     if what in checks and len(rest) == 2:
         checks[what](int(rest[0]), int(rest[1]))

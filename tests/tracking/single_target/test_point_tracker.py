@@ -155,7 +155,9 @@ def before_a_scene(rng, path, drift=(0.0, 0.0), frames=40):
     return [at(*uv) for uv in places + SIGMA * rng.standard_normal(places.shape)]
 
 
-@pytest.mark.parametrize(("speed", "drift"), [((1.0, -0.4), (0, 0)), ((0.0, 0.0), (0.8, 0.5)), ((2.5, 0.3), (0.8, 0.5))])
+@pytest.mark.parametrize(
+    ("speed", "drift"), [((1.0, -0.4), (0, 0)), ((0.0, 0.0), (0.8, 0.5)), ((2.5, 0.3), (0.8, 0.5))]
+)
 def test_before_a_scene_the_target_is_what_moves_otherwise(speed, drift):
     rng = np.random.default_rng(11)
     path = np.array([300.0, 300.0]) + np.arange(40)[:, None] * np.array(speed)
