@@ -206,7 +206,7 @@ def ensemble(seed: int, count: int) -> None:
                         break
             print(
                 f"{kind}, {scene_kind}: {len(centre)} of {count} measured; centre NEES/2 {np.mean(centre):.2f} +-"
-                f" {len(centre) ** -0.5:.2f}, above 4.6 (1 % of correct ones) {100 * np.mean(np.array(centre) > 4.6):.1f} %,"
+                f" {len(centre) ** -0.5:.2f}, {100 * np.mean(np.array(centre) > 4.6):.1f} % above 4.6 (1 % if correct),"
                 f" largest {np.max(centre):.1f}; radius NEES {np.mean(radius):.2f}"
             )
 
