@@ -104,15 +104,12 @@ class CandidateTracks:
         tracks = continued + started
         confirmed = _distinct([track for track in tracks if len(track) >= p.confirm])
         self._tracks = (confirmed + [track for track in tracks if len(track) < p.confirm])[:_MOST_TRACKS]
-        known = {track[-1].row for track in confirmed}
-        starts = [row for row in np.flatnonzero(may_start[:kept]).tolist() if row not in known]
-        self._last = [_first(found, cov, row) for row in starts]
-        self.several = False
-        if near is None or not confirmed:
-            chosen = _standing_out(confirmed)
-            self.several = bool(confirmed) and chosen is None
-            return chosen
-        return min(confirmed, key=lambda track: float(np.linalg.norm(track[-1].x[:2] - near)))
+        self._last = [_first(found, cov, row) for row in np.flatnonzero(may_start[:kept]).tolist()]
+        if near is not None:
+            return min(confirmed, key=lambda t: float(np.linalg.norm(t[-1].x[:2] - near)), default=None)
+        chosen = _standing_out(confirmed)
+        self.several = chosen is None and bool(confirmed)
+        return chosen
 
     def _continued(self, track: tuple[Step, ...], dt: float, found: Detections, cov: Array) -> tuple[Step, ...] | None:
         """A motion with the nearest detection in its gate; None: there is none."""
@@ -177,14 +174,14 @@ def _own_sigmas(track: tuple[Step, ...], tracks: Sequence[tuple[Step, ...]]) -> 
     The scene is that of the other motions, and at rest as far as these do not show it. A detection that is joined with
     another one from some picture on has moved in one half only.
     """
-    steps = len(track) - 1
-    alike = [t for t in tracks if t is not track and len(t) > steps]
-    if len(track) < _OWN_STEPS or len(alike) < min(len(tracks), _SCENE) - 1:
+    steps, structured = len(track) - 1, len(tracks) >= _SCENE
+    others = [t for t in tracks if t is not track and len(t) > steps]
+    if len(track) < _OWN_STEPS or len(others) < (2 if structured else 1):
         return 0.0
-    places = np.array([[t[-1 - back].x[:2] for back in (steps, steps // 2, 0)] for t in (track, *alike)])
-    own, *others = np.diff(places, axis=1)  # (2, 2) each: of both halves
-    scene = np.array(others) if len(tracks) >= _SCENE else np.zeros((1, 2, 2))
-    own = own - np.median(scene, axis=0)
+    places = np.array([[t[-1 - back].x[:2] for back in (steps, steps // 2, 0)] for t in (track, *others)])
+    moved = np.diff(places, axis=1)  # (n, 2, 2): of each motion in both halves
+    scene = moved[1:] if structured else np.zeros((1, 2, 2))
+    own = moved[0] - np.median(scene, axis=0)
     scatter_px = np.median(np.linalg.norm(scene - np.median(scene, axis=0), axis=-1), axis=0)
     sigmas = np.sqrt(np.trace(track[-1].P[:2, :2]) + scatter_px**2)
     return float(np.min(np.linalg.norm(own, axis=-1) / sigmas)) if own[0] @ own[1] > 0 else 0.0
