@@ -208,6 +208,7 @@ _PERIOD_PX, _LEAST_PERIODS = 40.0, 4.0
 _BLUR_SIGMA = 0.5  # 1 sigma of the correction for blur, as a share of it
 _ELLIPSE_COVERAGE = 0.7  # share of the rim that determines an ellipse
 _ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
+_ELLIPSE_LEFT = 0.95  # of the squares of the residuals: with more, that value is not reached with any number of points
 _LEAST_DETERMINANT = 1e-6  # of the normalised normal matrix: see `_solved`
 _ON_RIM_PX = 0.5  # least distance from the rim at which an edge counts as on it
 SECTORS = 32  # parts of a rim whose visibility is stated
@@ -378,6 +379,8 @@ def _oblique_fit(
     before = _sum_of_squares(circle[0], points, circle[1])
     once = _solve(points, 1.0, oblique=True)
     if once is None or np.hypot(once[0].cos2_px, once[0].sin2_px) > 0.25 * circle[0].radius_px:
+        return None
+    if _sum_of_squares(once[0], points, circle[1]) > _ELLIPSE_LEFT * before:
         return None
     again = rim_points(crop, once[0], 2.0, polarity, hidden)
     final = _solve(again, 0.0, oblique=True)
