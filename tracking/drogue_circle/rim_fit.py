@@ -236,12 +236,7 @@ class RimFit:
     @property
     def centre_and_radius(self) -> Array:
         """(3,) u, v, radius, px."""
-        return np.array(self.circle)
-
-    @property
-    def circle(self) -> tuple[float, float, float]:
-        """u, v, radius, px."""
-        return self.rim.u_px, self.rim.v_px, self.rim.radius_px
+        return np.array([self.rim.u_px, self.rim.v_px, self.rim.radius_px])
 
     def is_equal(self, other: RimFit) -> bool:
         """Whether two fits are the same circle, to a twentieth of a pixel."""

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from geometry.arrays import Array, Bools, symmetric
 from geometry.uncertainty.chi_square import chi2_limit
@@ -76,17 +75,12 @@ class CandidateTracks:
     """The candidate motions up to the last picture, and its detections that may start further ones."""
 
     parameters: PointParameters
-    _tracks: list[tuple[Step, ...]]
-    _last: list[Step]  # the detections of the last picture
+    _tracks: list[tuple[Step, ...]] = field(default_factory=list)
+    _last: list[Step] = field(default_factory=list)  # the detections of the last picture
     several: bool = False  # the last picture confirmed several motions, and it stays open which one is the target's
 
-    @staticmethod
-    def none(parameters: PointParameters) -> CandidateTracks:
-        """The state before the first picture."""
-        return CandidateTracks(parameters, [], [])
-
     def step(
-        self, dt: float, found: Detections, cov: Array, may_start: Bools, near: ArrayLike | None = None
+        self, dt: float, found: Detections, cov: Array, may_start: Bools, near: Array | None = None
     ) -> tuple[Step, ...] | None:
         """Continue with a picture's detections; cov (n, 2, 2), px^2. Returns the steps of a confirmed motion, or None.
 
@@ -132,8 +126,7 @@ def nearest(x: Array, P: Array, uv_px: Array, cov_px2: Array, p_gate: float) -> 
 
 
 def _first(found: Detections, cov: Array, row: int) -> Step:
-    P = np.full((4, 4), np.nan)
-    P[:2, :2] = cov[row]
+    P = np.pad(cov[row], (0, 2), constant_values=np.nan)
     return Step(np.array([*found.uv_px[row], np.nan, np.nan]), P, row, float(found.flux[row]))
 
 
@@ -145,10 +138,8 @@ def _second(first: Step, found: Detections, cov: Array, row: int, dt: float) -> 
 
 def _distinct(tracks: Sequence[tuple[Step, ...]]) -> list[tuple[Step, ...]]:
     """Of motions that end in the same detection the longest; of those the slowest: the others pass several objects."""
-    out: dict[int, tuple[Step, ...]] = {}
-    for track in sorted(tracks, key=lambda t: (-len(t), float(np.linalg.norm(t[-1].x[:2] - t[0].x[:2])))):
-        out.setdefault(track[-1].row, track)
-    return list(out.values())
+    ordered = sorted(tracks, key=lambda t: (len(t), -float(np.linalg.norm(t[-1].x[:2] - t[0].x[:2]))))
+    return list({track[-1].row: track for track in ordered}.values())
 
 
 def _standing_out(tracks: Sequence[tuple[Step, ...]]) -> tuple[Step, ...] | None:
@@ -163,7 +154,7 @@ def _standing_out(tracks: Sequence[tuple[Step, ...]]) -> tuple[Step, ...] | None
     (most, best), (second, _) = own[:2]
     if most > _OWN_SIGMAS and (len(tracks) >= _SCENE or second <= _OWN_SIGMAS):
         return tracks[best]
-    if len(tracks) >= _SCENE or len(tracks[0]) < _OWN_STEPS:
+    if len(tracks) >= _SCENE or max(map(len, tracks)) < _OWN_STEPS:
         return None
     return min(tracks, key=lambda t: (max(s.row for s in t), sum(s.row for s in t)))
 
@@ -264,7 +255,7 @@ class PointTracker:
     def __init__(self, parameters: PointParameters = USUAL) -> None:
         self.parameters = parameters
         self.acquired: tuple[Step, ...] = ()  # after a step that started a track: its detections, this one last
-        self._candidates = CandidateTracks.none(parameters)
+        self._candidates = CandidateTracks(parameters)
         self._x: Array | None = None  # None: no track
         self._P = np.zeros((4, 4))
         self._sigma_a = parameters.sigma_a_px
@@ -311,13 +302,14 @@ class PointTracker:
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._P[:2, :2])[1]))
         if self._unseen > self.parameters.max_predicted or sigma > self.parameters.lost_sigma_px:
             self._last_px, self._x = predicted, None
-            self._candidates, self._waited = CandidateTracks.none(self.parameters), 0.0
+            self._candidates, self._waited = CandidateTracks(self.parameters), 0.0
             return replace(NOTHING, predicted_px=predicted, nis=nis, sigma_a_px=self._sigma_a)
         return self._estimate(PoseStatus.PREDICTED, predicted, nis, UNMATCHED)
 
     def _acquire(self, found: Detections) -> PointEstimate:
         cov = self._covariances(found)
-        near = self.parameters.start_px if self._last_px is None else self._last_px
+        start = self.parameters.start_px
+        near = np.array(start) if start is not None and self._last_px is None else self._last_px
         steps = self._candidates.step(self._waited, found, cov, self._may_start(found), near)
         self._waited = 0.0
         if steps is None:
