@@ -74,7 +74,7 @@ def real(folder: Path) -> None:
         print(f"{path.name}: {len(search.circles)} circles, {'one is clear' if search.found else 'ambiguous'}")
         for c in search.circles:
             sigma = np.sqrt(np.diag(c.covariance_px2))
-            u, v, radius = c.circle
+            u, v, radius = c.centre_and_radius
             print(f"  {u:.2f} {v:.2f} r {radius:.2f} sigma {sigma[0]:.3f} {sigma[1]:.3f} coverage {c.coverage:.2f}")
 
 

@@ -4,16 +4,20 @@ python -m bench.related_measurements.second_checks occlusion SEED COUNT     coef
 python -m bench.related_measurements.second_checks empty SEED COUNT         100 frames of COUNT scenes without a target
 python -m bench.related_measurements.second_checks edges SEED COUNT         thin rims: which edge is tracked
 python -m bench.related_measurements.second_checks consistency SEED COUNT   errors of centres against their sigmas
+python -m bench.related_measurements.second_checks ensemble SEED COUNT      the same, one frame of each video
 python -m bench.related_measurements.second_checks approaches SEED COUNT    approaching drogues, by the light tracker
 python -m bench.related_measurements.second_checks detector SEED COUNT [WEIGHTS]  COUNT drogues of each scene
 python -m bench.related_measurements.second_checks third SEED COUNT [WEIGHTS]  the same with the renderer of validation
 python -m bench.related_measurements.second_checks point SEED COUNT [NAME=NUMBER]   discs by the point tracker
+python -m bench.related_measurements.second_checks first SEED COUNT      the same before structure: where tracks start
 """
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +37,7 @@ from tracking.drogue_circle.detectors import Edge
 from tracking.learned_detector.detector import WEIGHTS, find_drogues
 from tracking.noise import Picture
 from tracking.single_target.blobs import find_blobs
-from tracking.single_target.point_tracker import PointTracker
+from tracking.single_target.point_tracker import PointTracker, track_point
 from tracking.statuses import Cause, PoseStatus
 
 _CLEAR, _HELD = 30, 20  # frames before a probe comes, and after it has arrived
@@ -184,6 +188,29 @@ def consistency(seed: int, count: int) -> None:
         )
 
 
+def ensemble(seed: int, count: int) -> None:
+    """NEES / 2 of the centre and NEES of the radius in the first measured frame: one draw of each of COUNT videos."""
+    for kind in ("plain", "textured"):
+        for scene_kind in ("sky", "cloud"):
+            centre, radius = [], []
+            for n in range(count):
+                rng = np.random.default_rng(1000 * seed + n)
+                scene, look = render.background(scene_kind, rng), render.face(kind, rng)
+                circles, tracker = motion(rng, False, (30.0, 120.0)), CircleOptions(edge="outer").tracker()
+                for circle in itertools.islice(circles, 3):
+                    frame = tracker.step(render.draw(scene, look, *circle, rng))
+                    if frame.status is PoseStatus.MEASURED:
+                        away = frame.state[:3] - circle
+                        centre.append(away[:2] @ np.linalg.solve(frame.covariance[:2, :2], away[:2]) / 2)
+                        radius.append(away[2] ** 2 / frame.covariance[2, 2])
+                        break
+            print(
+                f"{kind}, {scene_kind}: {len(centre)} of {count} measured; centre NEES/2 {np.mean(centre):.2f} +-"
+                f" {len(centre) ** -0.5:.2f}, {100 * np.mean(np.array(centre) > 4.6):.1f} % above 4.6 (1 % if correct),"
+                f" largest {np.max(centre):.1f}; radius NEES {np.mean(radius):.2f}"
+            )
+
+
 def approaches(seed: int, count: int) -> None:
     """Drogues that come from 9 to 120 px in 90 frames; something hides them for six of these."""
     for kind in ("cloud", "ground"):
@@ -295,6 +322,41 @@ def point(seed: int, count: int, setting: str = "") -> None:
     )
 
 
+def first(seed: int, count: int) -> None:
+    """Discs of 3 to 12 px radius, 40 frames: where the first motion starts, before scenes at rest and drifting ones."""
+    for kind, way in itertools.product(("cloud", "ground", "water"), ("sways", "rests", "drifts")):
+        starts, right, false, found_in = Counter[str](), 0, 0, 0
+        for n in range(count):
+            rng = np.random.default_rng(1000 * seed + n)
+            wide = render.background(kind, rng, (render.SIZE[0] + 50, render.SIZE[1] + 50))
+            look = render.face("plain", rng)
+            bright = look.bright > 100 and kind != "cloud"  # clouds are as bright as that
+            look = look if bright else render.replace(look, bright=min(look.bright, 50.0))
+            drift = rng.uniform(0, 1, 2) * (way == "drifts")
+            settings = PointOptions("brighter" if bright else "darker").settings()
+            circles = list(itertools.islice(motion(rng, way != "rests", (3.0, 12.0)), 40))
+            found = []
+            for k, circle in enumerate(circles):
+                left, top = np.floor(drift * k).astype(int)
+                scene = wide[top : top + render.SIZE[1], left : left + render.SIZE[0]]
+                found.append(find_blobs(render.draw(scene, look, *circle, rng), settings.blobs))
+            near = [0.2 * c[2] + 1 for c in circles]
+            pairs = list(zip(found, circles, near, strict=True))
+            found_in += sum(bool((np.linalg.norm(f.uv_px - c[:2], axis=1) < r).any()) for f, c, r in pairs)
+            track = track_point(np.append(0.0, np.ones(39)), found, settings.track)
+            hits = [
+                float(np.hypot(*(e.x[:2] - c[:2]))) < r
+                for e, c, r in zip(track, circles, near, strict=True)
+                if e.status is PoseStatus.MEASURED
+            ]
+            starts["nowhere" if not hits else "at the disc" if hits[0] else "elsewhere"] += 1
+            right, false = right + sum(hits), false + len(hits) - sum(hits)
+        print(
+            f"{kind}, disc {way if way != 'drifts' else 'sways, scene drifts'}: tracks start {dict(starts)}; of"
+            f" {40 * count} frames {right} right, {false} elsewhere; the disc is detected in {found_in}"
+        )
+
+
 if __name__ == "__main__":
     what, *rest = sys.argv[1:] or [""]
     checks = {
@@ -306,6 +368,8 @@ if __name__ == "__main__":
         "detector": detector,
         "third": third,
         "point": point,
+        "first": first,
+        "ensemble": ensemble,
     }
     if what in checks and len(rest) == 2:
         checks[what](int(rest[0]), int(rest[1]))

@@ -182,7 +182,7 @@ def point(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> Non
 
     A video, a folder of pictures, or a CSV table with frame,u_px,v_px (such as detections.csv). A constant-velocity
     Kalman filter predicts the position where the target is hidden, and finds it again. Without --near the target is the
-    brightest one; wide edges, as parts of clouds have, count against it.
+    only one, or the one that moves otherwise than the others; of two the brighter one, with sharp edges.
 
     \b
     Example:

@@ -113,7 +113,7 @@ class CircleTarget(Target[CircleFrame]):
             angle = 0.5 * np.degrees(np.arctan2(fit.rim.sin2_px, fit.rim.cos2_px))
             angle = 90.0 - (90.0 - angle) % 180.0 if away else 0.0  # into (-90, 90]
             radius = fit.rim.radius_px
-            cells += texts([fit.coverage, fit.rms_px, *fit.circle, radius + away, radius - away, angle])
+            cells += texts([fit.coverage, fit.rms_px, *fit.centre_and_radius, radius + away, radius - away, angle])
         return [number, f"{number / rate_hz:.9g}", *cells]
 
     def findings(self, track: Track[CircleFrame]) -> list[Finding]:

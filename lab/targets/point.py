@@ -113,6 +113,8 @@ class PointFrame:
         """Why it is not measured."""
         if self.status is PoseStatus.MEASURED:
             return Cause.NONE
+        if self.estimate.several:
+            return Cause.AMBIGUOUS
         return Cause.NO_IMAGE if self.detections is None else Cause.NOT_FOUND
 
     @property
@@ -142,8 +144,8 @@ class PointTarget(Target[PointFrame]):
     """A point of light, or the centre of a larger target."""
 
     schema, table, columns = "beampose/track-point/1", "track.csv", COLUMNS
-    subject = "target"
-    codes = Codes(none="BP-N01", few="BP-N02", missing="BP-N06", ambiguous="", far="")
+    subject, several = "target", "several objects, and none moves while the others do not"
+    codes = Codes(none="BP-N01", few="BP-N02", missing="BP-N06", ambiguous="BP-N05", far="")
     usual_missing = 0.05
     options: PointOptions
 

@@ -238,13 +238,10 @@ def in_window(picture: Picture, window: Window, p: CircleParameters) -> list[Cir
     area = (int(low[0]), int(high[0]), int(low[1]), int(high[1]))
     radii = (window.min_radius_px, window.max_radius_px)
     rows, columns = centres(centre_votes(edges, radii, area), 4 * _CENTRES_OF_WINDOW)
-    out: list[CircleCandidate] = []
-    used = 0
-    for row, column in zip((rows + area[0]).tolist(), (columns + area[2]).tolist(), strict=True):
-        if np.hypot(column - u, row - v) < gate and used < _CENTRES_OF_WINDOW:
-            used += 1
-            out += radii_of(edges, column, row, radii, _RADII_OF_CENTRE)
-    moved = [replace(c, u_px=c.u_px + left, v_px=c.v_px + top) for c in out]
+    places = zip((columns + area[2]).tolist(), (rows + area[0]).tolist(), strict=True)
+    near = [(x, y) for x, y in places if np.hypot(x - u, y - v) < gate][:_CENTRES_OF_WINDOW]
+    found = [c for x, y in near for c in radii_of(edges, x, y, radii, _RADII_OF_CENTRE)]
+    moved = [replace(c, u_px=c.u_px + left, v_px=c.v_px + top) for c in found]
     return sorted(moved, key=lambda c: -c.score)
 
 
@@ -267,14 +264,8 @@ def whole_picture(picture: Picture, p: CircleParameters) -> list[CircleCandidate
             for row, column in zip(*centres(centre_votes(edges, (band, top), area), _CENTRES_OF_LEVEL), strict=True):
                 for c in radii_of(edges, float(column), float(row), (band, top), _RADII_OF_CENTRE):
                     away = 0.5 * (scale - 1)  # the centre of the first pixel of a level, in pixels of the picture
-                    out.append(
-                        replace(
-                            c,
-                            u_px=c.u_px * scale + away,
-                            v_px=c.v_px * scale + away,
-                            radius_px=c.radius_px * scale,
-                        )
-                    )
+                    u, v = c.u_px * scale + away, c.v_px * scale + away
+                    out.append(replace(c, u_px=u, v_px=v, radius_px=c.radius_px * scale))
         scale *= 2
         level = _reduced(picture, scale)
     return sorted(out, key=lambda c: -c.score)

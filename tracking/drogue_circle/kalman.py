@@ -22,23 +22,23 @@ PRINTED_P0 = np.diag([50.0, 20.0, 5.0, 50.0, 20.0, 5.0]) ** 2 / 9  # eq. (3)
 class MotionModel:
     """How one filter of the bank expects the circle to move; states with accelerations (9,)."""
 
-    acceleration_px: Array  # (3,) px/frame^2, 1 sigma, white; zero where the acceleration is a state
-    jerk_px: Array  # (3,) px/frame^3, 1 sigma, white; zero where the acceleration is white
+    acceleration_px: tuple[float, ...]  # (3,) px/frame^2, 1 sigma, white; zero where the acceleration is a state
+    jerk_px: tuple[float, ...]  # (3,) px/frame^3, 1 sigma, white; zero where the acceleration is white
 
     def transition(self, dt: float) -> Array:
         """Phi (9, 9). Where the acceleration is white, its state stays zero."""
         phi = np.zeros((9, 9))
         phi[:6, :6] = transition(dt, 3)
-        if self.jerk_px.any():
+        if any(self.jerk_px):
             phi[:3, 6:], phi[3:6, 6:], phi[6:, 6:] = 0.5 * dt**2 * np.eye(3), dt * np.eye(3), np.eye(3)
         return phi
 
     def noise(self, dt: float) -> Array:
         """Q (9, 9), of values that are constant within a step."""
         Q = np.zeros((9, 9))
-        Q[:6, :6] = process_noise(self.acceleration_px, dt)
+        Q[:6, :6] = process_noise(np.array(self.acceleration_px), dt)
         gamma = np.concatenate([dt**3 / 6 * np.eye(3), 0.5 * dt**2 * np.eye(3), dt * np.eye(3)])
-        return Q + gamma @ np.diag(self.jerk_px**2) @ gamma.T
+        return Q + gamma @ np.diag(np.square(self.jerk_px)) @ gamma.T
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class FilterBank:
         P[:, :3, :3] = R
         P[:, 3:6, 3:6] = np.diag((rate_sigma_px * third) ** 2)
         for i, model in enumerate(models):
-            if model.jerk_px.any():
+            if any(model.jerk_px):
                 P[i, 6:, 6:] = np.diag((0.1 * rate_sigma_px * third) ** 2)
         return cls(np.tile(np.concatenate([z, np.zeros(6)]), (n, 1)), P, np.zeros(n), models)
 
@@ -102,22 +102,14 @@ def motion_models(
     accelerations_px: tuple[float, ...], jerks_px: tuple[float, ...], radius_share: float
 ) -> tuple[MotionModel, ...]:
     """One model for each acceleration and each jerk of the centre; those of the radius are a share of them."""
-    shares, none = np.array([1.0, 1.0, radius_share]), np.zeros(3)
-    white = [MotionModel(a * shares, none) for a in accelerations_px]
-    return (*white, *(MotionModel(none, j * shares) for j in jerks_px))
+    white = [MotionModel((a, a, a * radius_share), (0.0, 0.0, 0.0)) for a in accelerations_px]
+    return (*white, *(MotionModel((0.0, 0.0, 0.0), (j, j, j * radius_share)) for j in jerks_px))
 
 
 @lru_cache(maxsize=16)
-def _stacked_of(key: tuple[float, ...], dt: float) -> tuple[Array, Array]:
-    rows = np.array(key).reshape(-1, 6)
-    models = [MotionModel(row[:3], row[3:]) for row in rows]
-    return np.array([m.transition(dt) for m in models]), np.array([m.noise(dt) for m in models])
-
-
 def _stacked(models: tuple[MotionModel, ...], dt: float) -> tuple[Array, Array]:
     """Phi and Q (n, 9, 9) of all models; they are the same in most frames."""
-    key = tuple(float(v) for m in models for v in (*m.acceleration_px, *m.jerk_px))
-    return _stacked_of(key, dt)
+    return np.array([m.transition(dt) for m in models]), np.array([m.noise(dt) for m in models])
 
 
 def printed_coefficient(area: float, previous_area: float) -> float:

@@ -24,7 +24,6 @@ _LIGHT = 0.15  # largest change of the light from the mean appearance, as a shar
 _RATE, _FIRST = 0.1, 8  # of the running means; the first frames are averaged
 _NEXT_TO_RIM, _SECTOR_SHARE = 0.75, 0.5  # part of the radius, and least share of its cells in a sector that match
 _USUAL = 0.35  # share of the rays of a sector, below which its edges are left out
-_USUAL_RMS, _LEAST_RMS_PX = 2.0, 0.3  # times the mean residual of the rim, and px: up to here a rim is as usual
 _CLEAR = 0.2  # coefficient below which the rim of a frame is that of a clear target
 _CHANGED = 1 / 500  # rate at which cells that look different become the appearance: no probe stays for that long
 _RHO = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)  # cells of equal area
@@ -116,10 +115,9 @@ def _contrast(values_dn: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class RimHabit:
-    """Where and how precisely the rim shows in clear frames: it may have no edge against a part of its background."""
+    """Where the rim shows in clear frames: it may have no edge against a part of its background."""
 
     sectors: Array  # (sectors,) mean share of the rays with an edge on the rim
-    rms_px: float  # mean residual of the edge points
     frames: int
 
     @property
@@ -132,15 +130,10 @@ class RimHabit:
         """Sectors (sectors,) whose edges are usually not those of the rim."""
         return np.asarray(self.sectors < _USUAL) if self.frames >= _FIRST else np.zeros(SECTORS, dtype=bool)
 
-    def is_usual(self, fit: RimFit) -> bool:
-        """Whether the residuals of a fit are those of the rim; a mixture of two edges has larger ones."""
-        return fit.rms_px <= max(_USUAL_RMS * self.rms_px, _LEAST_RMS_PX)
-
     def updated(self, fit: RimFit) -> RimHabit:
         """With one more clear frame."""
         rate = max(_RATE, 1 / (self.frames + 1))
-        sectors = self.sectors + rate * (fit.sectors - self.sectors)
-        return RimHabit(sectors, self.rms_px + rate * (fit.rms_px - self.rms_px), self.frames + 1)
+        return RimHabit(self.sectors + rate * (fit.sectors - self.sectors), self.frames + 1)
 
 
 def is_clear(coefficient: float) -> bool:

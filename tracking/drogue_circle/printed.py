@@ -96,7 +96,7 @@ class PrintedTracker:
             return nothing_known(Cause.AMBIGUOUS if len(found.circles) > 1 else Cause.NOT_FOUND)
         z = found.found.centre_and_radius
         self._x, self._P, self._misses = np.concatenate([z, np.zeros(3)]), PRINTED_P0.copy(), 0
-        self._appearance = first_appearance(*disc_cells(picture, *found.found.circle))
+        self._appearance = first_appearance(*disc_cells(picture, *found.found.centre_and_radius))
         self._area = self._filled(picture, z)
         return CircleFrame(
             PoseStatus.MEASURED, Cause.NONE, self._x, self._P, np.full(3, np.nan), None, 0.0, event="acquired"

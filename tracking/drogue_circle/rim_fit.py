@@ -19,12 +19,11 @@ _STEP_PX = 0.5  # sampling along a ray
 _LEAST_RAYS, _MOST_RAYS = 40, 256  # one per pixel of the circumference between these
 _OBLIQUE = 0.6  # largest tangential slope, as a share of the radial one: the edge crosses the rim at up to 31 degrees
 _MOST_BLUR = 1.2  # of the half width of the rays: a wider edge has no known height
-_LEAST_SHARE = 0.25  # of the median slope of the rim: weaker maxima are not the rim
 _LEAST_SLOPE = 3.0  # standard deviations of the slope's noise
 # Slopes beside the rim: over so many radii, at most so many px, from the rays' ends; averaged over so much of the rim.
 _BESIDE, _BESIDE_PX, _ALONG_PX = 0.3, 3.0, 5.0
-# Shares of the median slope of the rim: where a side is steeper in the mean, or a part of it, that is another edge.
-_ANOTHER, _ANOTHER_PART = 0.1, 0.3
+# Share of the median slope of the rim: a part of a side that is steeper, less the mean, is another edge.
+_ANOTHER_PART = 0.3
 _LEAST_COMMON_PX = 0.03  # a smaller common shift of all edges is not fitted
 CORRELATED_PX = 3.5  # length of rim over which the filter's noise is correlated
 
@@ -123,8 +122,6 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     rows = np.arange(n)
     strength = middle[rows, best]
     good = inside & (score[rows, best] > 0)
-    if good.any():
-        good &= strength > _LEAST_SHARE * upper_median(strength[good])
     a, b, c = slope[rows, best], strength, slope[rows, best + 2]
     bend = np.where(good, a - 2 * b + c, -1.0)
     vertex = np.clip(0.5 * (a - c) / np.minimum(bend, -1e-12), -0.5, 0.5)  # of a parabola through three slopes
@@ -174,7 +171,7 @@ def _beside(
     means = np.mean(slopes[good], axis=0)
     edge = np.abs(slopes - means) > _ANOTHER_PART * steep
     mean = _along_rim(np.concatenate([slopes - means, edge], axis=1), wide)
-    away = np.where((np.abs(means) > _ANOTHER * steep) | (mean[:, 2:] > 0), 0.0, mean[:, :2])
+    away = np.where(mean[:, 2:] > 0, 0.0, mean[:, :2])
     # A Wiener filter: what is mostly noise is left out. The median of a squared normal error is .455 of its variance.
     noise = 0.455 * 2 * (crop.noise_dn / length) ** 2 * min(CORRELATED_PX / _ALONG_PX, 1.0)
     away *= np.maximum(1 - noise / np.maximum(np.median(away[good] ** 2, axis=0), 1e-12), 0.0)
@@ -211,6 +208,7 @@ _PERIOD_PX, _LEAST_PERIODS = 40.0, 4.0
 _BLUR_SIGMA = 0.5  # 1 sigma of the correction for blur, as a share of it
 _ELLIPSE_COVERAGE = 0.7  # share of the rim that determines an ellipse
 _ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
+_ELLIPSE_LEFT = 0.95  # of the squares of the residuals: with more, that value is not reached with any number of points
 _LEAST_DETERMINANT = 1e-6  # of the normalised normal matrix: see `_solved`
 _ON_RIM_PX = 0.5  # least distance from the rim at which an edge counts as on it
 SECTORS = 32  # parts of a rim whose visibility is stated
@@ -238,12 +236,7 @@ class RimFit:
     @property
     def centre_and_radius(self) -> Array:
         """(3,) u, v, radius, px."""
-        return np.array(self.circle)
-
-    @property
-    def circle(self) -> tuple[float, float, float]:
-        """u, v, radius, px."""
-        return self.rim.u_px, self.rim.v_px, self.rim.radius_px
+        return np.array([self.rim.u_px, self.rim.v_px, self.rim.radius_px])
 
     def is_equal(self, other: RimFit) -> bool:
         """Whether two fits are the same circle, to a twentieth of a pixel."""
@@ -282,9 +275,7 @@ def fit_rim(
         circle = _solve(points, 0.0, oblique=False)
     if circle is None:
         return None
-    solved = None
-    if _looks_oblique(points, circle[0]):
-        solved = _oblique_fit(crop, circle, points, coarse.polarity, hidden)
+    solved = _oblique_fit(crop, circle, points, coarse.polarity, hidden)
     rim, points, weight = solved or _without_ends(points, circle, oblique=False)
     return _described(rim, points, weight, coarse, min_coverage)
 
@@ -384,6 +375,8 @@ def _oblique_fit(
     once = _solve(points, 1.0, oblique=True)
     if once is None or np.hypot(once[0].cos2_px, once[0].sin2_px) > 0.25 * circle[0].radius_px:
         return None
+    if _sum_of_squares(once[0], points, circle[1]) > _ELLIPSE_LEFT * before:
+        return None
     again = rim_points(crop, once[0], 2.0, polarity, hidden)
     final = _solve(again, 0.0, oblique=True)
     if final is None or np.mean(final[1] > 0) < _ELLIPSE_COVERAGE:
@@ -392,16 +385,6 @@ def _oblique_fit(
     independent = max(float(np.count_nonzero(final[1])) / together - 5, 1.0)
     gained = before / max(_sum_of_squares(final[0], again, final[1]), 1e-12) - 1
     return _without_ends(again, final, oblique=True) if 0.5 * gained * independent > _ELLIPSE_F else None
-
-
-def _looks_oblique(points: RimPoints, rim: Rim) -> bool:
-    """Whether the distances of all edge points, the rejected ones too, follow an ellipse."""
-    found = np.isfinite(points.radius_px)
-    if found.mean() < _ELLIPSE_COVERAGE:
-        return False
-    away = points.radius_px[found] - rim.radius_at(points.theta[found])
-    both = np.array([np.mean(away * np.cos(2 * points.theta[found])), np.mean(away * np.sin(2 * points.theta[found]))])
-    return bool(2 * np.hypot(*both) > 0.7 * np.std(away))
 
 
 def _sum_of_squares(rim: Rim, points: RimPoints, weight: Array | Bools) -> float:

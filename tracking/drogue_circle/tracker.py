@@ -93,7 +93,7 @@ def _about(picture: Picture, fit: RimFit, p: CircleParameters) -> list[RimFit]:
 
     The reduced pictures of the search do not show both edges of a thin rim.
     """
-    u, v, radius = fit.circle
+    u, v, radius = fit.centre_and_radius
     reach = min(_REACH * radius, p.max_radius_px or 0.5 * max(picture.shape[:2]))
     crop = smooth_crop(picture, Window(u, v, reach + 10, 0.0, 0.0, 0.0), p.blur_px)
     size = (int(2 * (reach + 4)), 256)  # rows are directions, columns half pixels of the radius
@@ -161,7 +161,7 @@ def _fitted(
             fit is not None
             and p.min_radius_px <= fit.rim.radius_px <= largest
             and is_certain(fit)
-            and _may_be(*fit.circle, fit.polarity, wanted)
+            and _may_be(fit.rim.u_px, fit.rim.v_px, fit.rim.radius_px, fit.polarity, wanted)
         ):
             fits.append(fit)
     return fits
@@ -173,7 +173,7 @@ def _best_near(crop: SmoothCrop, fit: RimFit, p: CircleParameters) -> RimFit:
     Several rims next to each other, of which each is seen in part, have a local optimum of points of two of them: a
     mixture. A start next to one of the rims leads to it alone, with smaller residuals.
     """
-    u, v, radius = fit.circle
+    u, v, radius = fit.centre_and_radius
     step = min(_SHIFT * radius, _MOST_SHIFT_PX)
     angles = 2 * np.pi * np.arange(_SHIFTS) / _SHIFTS
     shifts = [(0.0, 0.0), *zip((step * np.cos(angles)).tolist(), (step * np.sin(angles)).tolist(), strict=True)]
@@ -258,8 +258,8 @@ class Track:
     @classmethod
     def started(cls, picture: Picture, fit: RimFit, p: CircleParameters) -> Track:
         """A track that begins with a circle of the whole picture, at rest within a quarter of its radius per frame."""
-        cells = disc_cells(picture, *fit.circle)
-        habit = RimHabit(fit.sectors, fit.rms_px, 1)
+        cells = disc_cells(picture, *fit.centre_and_radius)
+        habit = RimHabit(fit.sectors, 1)
         return cls(_bank_at(fit, p), first_appearance(*cells), habit, fit, cells)
 
     def state(self) -> tuple[Array, Array]:
@@ -327,14 +327,14 @@ class Track:
         self, picture: Picture, crop: SmoothCrop, fit: RimFit, p: CircleParameters
     ) -> tuple[RimFit | None, float]:
         """The fit without the edges in sectors that an occluder hides: they pull the circle to one side."""
-        gamma = self._coefficient(picture, *fit.circle)
+        gamma = self._coefficient(picture, *fit.centre_and_radius)
         least = p.min_coverage * self.habit.coverage  # of the rim that shows in clear frames
         for _ in range(_REFITS):
             hidden = self.appearance.hidden_sectors(*self.cells)
             turned = hidden.mean() > _TURNED and fit.coverage >= _USUAL * self.habit.coverage
             if turned or not hidden.any():
                 break
-            u, v, radius = fit.circle
+            u, v, radius = fit.centre_and_radius
             coarse = CircleCandidate(u, v, radius, 0.0, fit.polarity)
             again = fit_rim(crop, coarse, least, hidden | self.habit.without_edge)
             if again is None:
@@ -342,9 +342,8 @@ class Track:
             still, fit = again.is_equal(fit), again
             if still:
                 break
-            gamma = self._coefficient(picture, *fit.circle)
-        usual = is_clear(gamma) or self.habit.is_usual(fit)
-        return (fit if usual else None), gamma
+            gamma = self._coefficient(picture, *fit.centre_and_radius)
+        return fit, gamma
 
     def _candidates(
         self, picture: Picture, window: Window, detector: CircleDetector, p: CircleParameters
@@ -352,11 +351,7 @@ class Track:
         """The predicted circle, then those of the detector: which is called only if it is needed."""
         radius = 0.5 * (window.min_radius_px + window.max_radius_px)
         yield CircleCandidate(window.u_px, window.v_px, radius, np.inf, self.fit.polarity)
-        yield from sorted(detector(picture, window), key=self._preference, reverse=True)[: p.candidates]
-
-    def _preference(self, c: CircleCandidate) -> float:
-        """The score of a candidate, halved if its polarity is not that of the tracked rim."""
-        return c.score * (1.0 if c.polarity in (0, self.fit.polarity) else 0.5)
+        yield from detector(picture, window)[: p.candidates]
 
     def _coefficient(self, picture: Picture, u_px: float, v_px: float, radius_px: float) -> float:
         self.cells = disc_cells(picture, u_px, v_px, radius_px)
@@ -487,7 +482,7 @@ class CircleTracker:
         search = acquire(picture, self.detector, self.parameters, wanted)
         if search.found is None:
             return None
-        if is_clear(track.appearance.coefficient(*disc_cells(picture, *search.found.circle))):
+        if is_clear(track.appearance.coefficient(*disc_cells(picture, *search.found.centre_and_radius))):
             track.restart(search.found, self.parameters)
         # After a longer gap the appearance of the own circle may have changed; a partly hidden one is not believed.
         elif track.misses >= _CHANGED * self.parameters.search_after and search.found.coverage > WHOLE:

@@ -48,11 +48,10 @@ def find_blobs(picture: Picture | NDArray[np.float32], parameters: BlobParameter
     covariance of a centroid is that of the contrast's noise; errors of the outline are not part of it. Blobs that touch
     the picture's edge are left out, since their centroid is not that of the target.
     """
-    wide = parameters.background_px
-    narrow = round(_NARROW * wide)
+    narrow = round(_NARROW * parameters.background_px)
     limited = replace(parameters, max_size_px=min(parameters.max_size_px, narrow / 2))
     small, small_slope = _blobs_before(picture, limited, narrow)
-    found, slope = _blobs_before(picture, parameters, wide)
+    found, slope = _blobs_before(picture, parameters, parameters.background_px)
     apart = (np.linalg.norm(small.uv_px[:, None] - found.uv_px, axis=-1) > narrow / 4).all(axis=1)
     slope = np.concatenate([slope, small_slope[apart]])
     slope = slope[np.argsort(-np.concatenate([found.flux, small.flux[apart]]), kind="stable")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -54,6 +54,10 @@ USUAL = PointParameters()
 # Source: eq. (9) of Duan (2020) for the first vector; the confirmation is ours.
 
 _MOST_TRACKS = 200  # candidate motions that are followed at once
+_LONGEST = 30  # steps of a motion that are kept while none of several stands out
+_OWN_STEPS = 8  # detections after which one of several motions can be the target's own; with 5, glitter has some
+_OWN_SIGMAS = 4.0  # by which it moves farther than the others do, in each half of its steps
+_SCENE = 3  # so many motions that move alike are a structured scene, any of which may be the target
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +75,9 @@ class CandidateTracks:
     """The candidate motions up to the last picture, and its detections that may start further ones."""
 
     parameters: PointParameters
-    _tracks: list[tuple[Step, ...]]
-    _last: list[Step]  # the detections of the last picture
-
-    @staticmethod
-    def none(parameters: PointParameters) -> CandidateTracks:
-        """The state before the first picture."""
-        return CandidateTracks(parameters, [], [])
+    _tracks: list[tuple[Step, ...]] = field(default_factory=list)
+    _last: list[Step] = field(default_factory=list)  # the detections of the last picture
+    several: bool = False  # the last picture confirmed several motions, and it stays open which one is the target's
 
     def step(
         self, dt: float, found: Detections, cov: Array, may_start: Bools, near: Array | None = None
@@ -85,7 +85,7 @@ class CandidateTracks:
         """Continue with a picture's detections; cov (n, 2, 2), px^2. Returns the steps of a confirmed motion, or None.
 
         dt: frames since the last picture. may_start (n,): detections where a motion may begin. Of several motions that
-        are confirmed, that of the foremost detections is chosen, or the one that is nearest to the place `near` (2,).
+        are confirmed, the one that is nearest to the place `near` (2,) is chosen, without one that which stands out.
         """
         p, kept = self.parameters, min(len(found), self.parameters.most_candidates)
         continued = [c for track in self._tracks if (c := self._continued(track, dt, found, cov)) is not None]
@@ -95,14 +95,15 @@ class CandidateTracks:
             for row in range(kept)
             if np.linalg.norm(found.uv_px[row] - first.x[:2]) <= p.max_speed_px * dt
         ]
-        self._tracks = (continued + started)[:_MOST_TRACKS]
+        tracks = continued + started
+        confirmed = _distinct([track for track in tracks if len(track) >= p.confirm])
+        self._tracks = (confirmed + [track for track in tracks if len(track) < p.confirm])[:_MOST_TRACKS]
         self._last = [_first(found, cov, row) for row in np.flatnonzero(may_start[:kept]).tolist()]
-        confirmed = [track for track in self._tracks if len(track) >= p.confirm]
-        if not confirmed:
-            return None
-        if near is None:
-            return _foremost(confirmed)
-        return min(confirmed, key=lambda track: float(np.linalg.norm(track[-1].x[:2] - near)))
+        if near is not None:
+            return min(confirmed, key=lambda t: float(np.linalg.norm(t[-1].x[:2] - near)), default=None)
+        chosen = _standing_out(confirmed)
+        self.several = chosen is None and bool(confirmed)
+        return chosen
 
     def _continued(self, track: tuple[Step, ...], dt: float, found: Detections, cov: Array) -> tuple[Step, ...] | None:
         """A motion with the nearest detection in its gate; None: there is none."""
@@ -112,7 +113,7 @@ class CandidateTracks:
         if row is None:
             return None
         x, P = kalman.update(x, P, found.uv_px[row], cov[row])
-        return (*track, Step(x, P, row, float(found.flux[row])))
+        return (*track[-_LONGEST:], Step(x, P, row, float(found.flux[row])))
 
 
 def nearest(x: Array, P: Array, uv_px: Array, cov_px2: Array, p_gate: float) -> tuple[int | None, float]:
@@ -125,8 +126,7 @@ def nearest(x: Array, P: Array, uv_px: Array, cov_px2: Array, p_gate: float) -> 
 
 
 def _first(found: Detections, cov: Array, row: int) -> Step:
-    P = np.full((4, 4), np.nan)
-    P[:2, :2] = cov[row]
+    P = np.pad(cov[row], (0, 2), constant_values=np.nan)
     return Step(np.array([*found.uv_px[row], np.nan, np.nan]), P, row, float(found.flux[row]))
 
 
@@ -136,9 +136,46 @@ def _second(first: Step, found: Detections, cov: Array, row: int, dt: float) -> 
     return Step(x, P, row, float(found.flux[row]))
 
 
-def _foremost(tracks: Sequence[tuple[Step, ...]]) -> tuple[Step, ...]:
-    """The motion whose last detection in the order of its picture comes first there: the brightest, or sharpest."""
+def _distinct(tracks: Sequence[tuple[Step, ...]]) -> list[tuple[Step, ...]]:
+    """Of motions that end in the same detection the longest; of those the slowest: the others pass several objects."""
+    ordered = sorted(tracks, key=lambda t: (len(t), -float(np.linalg.norm(t[-1].x[:2] - t[0].x[:2]))))
+    return list({track[-1].row: track for track in ordered}.values())
+
+
+def _standing_out(tracks: Sequence[tuple[Step, ...]]) -> tuple[Step, ...] | None:
+    """The motion of the target; None: there is none, or the pictures leave open which one it is.
+
+    It is the only one, or moves while the scene does not, or comes first in the order of its pictures (the brightest,
+    or sharpest): of two motions alike, not of more, which are parts of a scene.
+    """
+    if len(tracks) < 2:
+        return tracks[0] if tracks else None
+    own = sorted(((_own_sigmas(t, tracks), k) for k, t in enumerate(tracks)), reverse=True)
+    (most, best), (second, _) = own[:2]
+    if most > _OWN_SIGMAS and (len(tracks) >= _SCENE or second <= _OWN_SIGMAS):
+        return tracks[best]
+    if len(tracks) >= _SCENE or max(map(len, tracks)) < _OWN_STEPS:
+        return None
     return min(tracks, key=lambda t: (max(s.row for s in t), sum(s.row for s in t)))
+
+
+def _own_sigmas(track: tuple[Step, ...], tracks: Sequence[tuple[Step, ...]]) -> float:
+    """By how many sigmas a motion moves otherwise than the scene, in that half of its steps where it is less.
+
+    The scene is that of the other motions, and at rest as far as these do not show it. A detection that is joined with
+    another one from some picture on has moved in one half only.
+    """
+    steps, structured = len(track) - 1, len(tracks) >= _SCENE
+    others = [t for t in tracks if t is not track and len(t) > steps]
+    if len(track) < _OWN_STEPS or len(others) < (2 if structured else 1):
+        return 0.0
+    places = np.array([[t[-1 - back].x[:2] for back in (steps, steps // 2, 0)] for t in (track, *others)])
+    moved = np.diff(places, axis=1)  # (n, 2, 2): of each motion in both halves
+    scene = moved[1:] if structured else np.zeros((1, 2, 2))
+    own = moved[0] - np.median(scene, axis=0)
+    scatter_px = np.median(np.linalg.norm(scene - np.median(scene, axis=0), axis=-1), axis=0)
+    sigmas = np.sqrt(np.trace(track[-1].P[:2, :2]) + scatter_px**2)
+    return float(np.min(np.linalg.norm(own, axis=-1) / sigmas)) if own[0] @ own[1] > 0 else 0.0
 
 
 # The tracker of one target: a constant-velocity Kalman filter with gate, prediction through misses, re-acquisition.
@@ -204,6 +241,7 @@ class PointEstimate:
     nis: float  # normalised innovation squared of the detection, or of the nearest one outside the gate
     row: int  # the detection, or UNMATCHED
     sigma_a_px: float  # px/frame^2, estimated so far
+    several: bool = False  # lost: there are several motions, of which none stands out
 
 
 NOTHING = PointEstimate(
@@ -217,7 +255,7 @@ class PointTracker:
     def __init__(self, parameters: PointParameters = USUAL) -> None:
         self.parameters = parameters
         self.acquired: tuple[Step, ...] = ()  # after a step that started a track: its detections, this one last
-        self._candidates = CandidateTracks.none(parameters)
+        self._candidates = CandidateTracks(parameters)
         self._x: Array | None = None  # None: no track
         self._P = np.zeros((4, 4))
         self._sigma_a = parameters.sigma_a_px
@@ -264,16 +302,18 @@ class PointTracker:
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._P[:2, :2])[1]))
         if self._unseen > self.parameters.max_predicted or sigma > self.parameters.lost_sigma_px:
             self._last_px, self._x = predicted, None
-            self._candidates, self._waited = CandidateTracks.none(self.parameters), 0.0
+            self._candidates, self._waited = CandidateTracks(self.parameters), 0.0
             return replace(NOTHING, predicted_px=predicted, nis=nis, sigma_a_px=self._sigma_a)
         return self._estimate(PoseStatus.PREDICTED, predicted, nis, UNMATCHED)
 
     def _acquire(self, found: Detections) -> PointEstimate:
         cov = self._covariances(found)
-        steps = self._candidates.step(self._waited, found, cov, self._may_start(found), self._last_px)
+        start = self.parameters.start_px
+        near = np.array(start) if start is not None and self._last_px is None else self._last_px
+        steps = self._candidates.step(self._waited, found, cov, self._may_start(found), near)
         self._waited = 0.0
         if steps is None:
-            return NOTHING
+            return replace(NOTHING, several=self._candidates.several)
         if self._area is not None:
             self._lost_log_area = self._area.mean
         self._P_shift = np.zeros((4, 2))

@@ -148,6 +148,42 @@ def test_of_two_motions_that_of_the_foremost_detections_is_followed():
     assert track_point(steps(30), found, FIXED)[-1].row == 0
 
 
+def before_a_scene(rng, path, drift=(0.0, 0.0), frames=40):
+    """A target, the last of each picture, before six objects that drift; detections scatter by their sigma."""
+    scene = rng.uniform(100, 700, (6, 2)) + np.arange(frames)[:, None, None] * np.array(drift)
+    places = np.concatenate([scene, path[:, None]], axis=1)
+    return [at(*uv) for uv in places + SIGMA * rng.standard_normal(places.shape)]
+
+
+@pytest.mark.parametrize(
+    ("speed", "drift"), [((1.0, -0.4), (0, 0)), ((0.0, 0.0), (0.8, 0.5)), ((2.5, 0.3), (0.8, 0.5))]
+)
+def test_before_a_scene_the_target_is_what_moves_otherwise(speed, drift):
+    rng = np.random.default_rng(11)
+    path = np.array([300.0, 300.0]) + np.arange(40)[:, None] * np.array(speed)
+    track = track_point(steps(40), before_a_scene(rng, path, drift), FIXED)
+    assert [e.row for e in track] == [6] * 40, "from its first picture on"
+
+
+def test_where_nothing_moves_before_the_scene_there_is_no_position():
+    track = track_point(steps(40), before_a_scene(np.random.default_rng(12), np.full((40, 2), 300.0)), FIXED)
+    assert set(statuses(track)) == {"lost"}
+    assert all(e.several for e in track[3:])
+
+
+def test_what_jumps_once_is_no_target_that_moves():
+    """As the centroid of an object does that is joined with its neighbour from some picture on."""
+    path = np.array([300.0, 300.0]) + 2.0 * (np.arange(40) >= 20)[:, None]
+    track = track_point(steps(40), before_a_scene(np.random.default_rng(13), path), FIXED)
+    assert set(statuses(track)) == {"lost"}
+
+
+def test_of_several_objects_near_the_stated_place_the_nearest_is_followed():
+    found = [at((320.0, 300.0), (305.0, 300.0), (300.0, 330.0), flux=[9.0, 5.0, 7.0]) for _ in range(20)]
+    track = track_point(steps(20), found, replace(FIXED, start_px=(303.0, 301.0)))
+    assert [e.row for e in track] == [1] * 20
+
+
 @pytest.mark.parametrize("true", [0.02, 2.0])
 def test_the_process_noise_is_estimated(true):
     rng = np.random.default_rng(9)

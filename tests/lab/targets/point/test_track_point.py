@@ -167,6 +167,23 @@ def test_two_similar_targets_are_reported_and_one_can_be_chosen(tmp_path):
     assert chosen.result.frames[-1].place[0] == pytest.approx(path_of(19)[0] + 300, abs=0.1)
 
 
+def test_a_target_at_rest_before_a_scene_is_ambiguous_until_its_place_is_stated(tmp_path):
+    places = np.array([[40.0, 60.0], [200, 50], [90, 210], [300, 150]])
+    lines = [f"{k},{u},{v}" for k in range(20) for u, v in places]
+    table = tmp_path / "scene.csv"
+    table.write_text("frame,u_px,v_px\n" + "\n".join(lines) + "\n")
+    outcome = track_target(PointTarget(), table, tmp_path / "out")
+    assert outcome.exit_status == 4
+    assert {"BP-N01", "BP-N05"} <= {f.code for f in outcome.findings}
+    assert "--near" in next(f for f in outcome.findings if f.code == "BP-N01").remedy
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["counts"]["not_measured"]["ambiguous"] == 18
+    assert {r["u_px"] for r in rows_of(tmp_path / "out")} == {""}
+    chosen = track_target(PointTarget(PointOptions(near_px=(205.0, 60.0))), table, tmp_path / "other")
+    assert verdict(chosen.findings) is Level.PASS
+    assert chosen.result.frames[0].place[0] == pytest.approx(200, abs=0.1)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
