@@ -50,7 +50,9 @@ _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the midd
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
 GAINED_NATS = 2 * TURN_NATS  # by which a jerk must be more likely than turns: two have as many numbers as it has axes
-RESOLVED_NATS = 40.0  # by which turns must be more likely than one smooth turn, or a jerk, in their place
+# By which each of some turns must make these more likely than one smooth turn, or a jerk, in their place: the more turns
+# there are, the better they approximate any smooth motion.
+RESOLVED_NATS = 20.0
 _UNRESOLVED = 4.0  # frames: turns farther apart do not resemble one
 _WIDTHS, _SIZES = (
     np.array([1.0, 1.3, 1.7]),
@@ -183,7 +185,7 @@ class TurnSearch:
         lengths = _WIDTHS * (end - begin)
         tried = [Turn(0.5 * (begin + end), length, length, k * size) for length in lengths for k in _SIZES]
         nats = [run.nats([one]) for one in tried]
-        return tried[int(np.argmax(nats))] if max(nats) > run.nats(short) - RESOLVED_NATS else None
+        return tried[int(np.argmax(nats))] if max(nats) > run.nats(short) - RESOLVED_NATS * len(some) else None
 
     def largest(self, turn: Turn, all_turns: Sequence[Turn]) -> Turn:
         """A turn as large as the spots allow: slow motion hardly shows its size."""
