@@ -25,8 +25,8 @@ from tracking.smoothing.motion.run_detections import (
 DETERMINED = 0.3  # of the prior's sigma: a number whose sigma is larger keeps its prior
 MAX_CLOCK_STEPS = 4  # after each estimate of the motion
 _LONGEST_STEP = 0.5  # of a prior's sigma: a longer step is not linear
-# Of its sigma: a shorter step of a clock is not taken; from the third one on, which a linear problem does not take, since
-# turns that change with each step would change them without end.
+# Of its sigma: a shorter step of a clock is not taken; the second number from the third step on, which a linear problem
+# does not take: turns that change with each step would move the clocks without end.
 _NEGLIGIBLE_STEPS = 0.05, 0.5
 # The third of these steps or a later one, and the last, of a number whose sigma is below DETERMINED: longer than so
 # many of its sigmas, or than this share of its prior's. Then nothing is known of any: a linear problem takes one step.
