@@ -50,8 +50,8 @@ _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the midd
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
 GAINED_NATS = 2 * TURN_NATS  # by which a jerk must be more likely than turns: two have as many numbers as it has axes
-# For each turn, by which several must be more likely than one smooth turn, or a jerk, in their place: the more there are,
-# the better they approximate any smooth motion.
+# For each turn, by which several must be more likely than one smooth turn, or a jerk, in their place: the more there
+# are, the better they approximate any smooth motion.
 RESOLVED_NATS = 20.0
 _UNRESOLVED = 4.0  # frames: turns farther apart do not resemble one
 _WIDTHS, _SIZES = (
