@@ -149,10 +149,10 @@ FEWEST_VIEWS = 4
 # With a smaller angle between the boards' normals, focal length and distance cannot be separated.
 LEAST_TILT_DEG = 5.0
 _SCATTER_OF_TWO_LENSES = 2.0  # least factor on the noise: below it one cannot measure what two lenses leave of it
-# Most of the variance of the scatter that they leave (0 to .07 of it in four mixed sets) of so many photographs or more,
-# of FEWEST_VIEWS none, in between in proportion. The best split of as many normal numbers into two groups of
-# FEWEST_VIEWS or more leaves less in 1 of 10,000 samples: .025 of 8, .034 of 10, .053 of 12, .081 of 16, .105 of 20
-# (simulated; the test is that of Engelman and Hartigan 1969, J. American Statistical Association 64).
+# Most of the variance of the scatter that they leave (0 to .07 in four mixed sets) of so many photographs or more; of
+# FEWEST_VIEWS none, in between in proportion. The best split of as many normal numbers into two groups of FEWEST_VIEWS
+# or more leaves less in 1 of 10,000 samples: .025 of 8, .034 of 10, .053 of 12, .081 of 16, .105 of 20 (simulated; the
+# test is that of Engelman and Hartigan 1969, J. American Statistical Association 64).
 _LEFT_BY_TWO_LENSES, _LEFT_AS_MUCH_OF = 0.1, 20
 _NOISE_OF_SECOND = 2.0  # most noise of the smaller group over that of the other: rejected views have three times it
 _LENSES_DIFFER_PX = 1.0  # of directions, RMS over the picture; the sigmas include what smaller differences do
