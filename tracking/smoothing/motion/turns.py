@@ -54,10 +54,8 @@ GAINED_NATS = 2 * TURN_NATS  # by which a jerk must be more likely than turns: t
 # are, the better they approximate any smooth motion.
 RESOLVED_NATS = 20.0
 _UNRESOLVED = 4.0  # frames: turns farther apart do not resemble one
-_WIDTHS, _SIZES = (
-    np.array([1.0, 1.3, 1.7]),
-    (0.3, 1.0, 3.0, 10.0),
-)  # of their distance and variances: one in their place
+_WIDTHS = np.array([1.0, 1.3, 1.7])  # of the distance of some turns: the lengths of one in their place ...
+_SIZES = (0.3, 1.0, 3.0, 10.0)  # ... and of their variances: its sizes
 _CLOSE = 3.0  # frames between two turns in close succession
 _JERKS = 10.0 ** np.arange(-4, 2)  # of the jerk that changes the velocities as much within a frame
 _JERK_STEPS, _GAINED_BY_STEP = 20, 1.0  # from there, and nats that each must gain
