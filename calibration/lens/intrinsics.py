@@ -291,7 +291,7 @@ def _check_one_lens(table: CornerTable, found: LensFit, options: IntrinsicsOptio
 
     Two lenses, each fitted to its own photographs, then leave almost none of the scatter between photographs. Errors of
     each photograph's own, such as a lens that refocuses, are left in part: a quarter of many (uniform errors of one
-    unknown, split in the middle), less of a few. Photographs that the fit rejects may be those of the second lens.
+    unknown, split in the middle), less of a few. Photographs rejected as a whole may be those of the second lens.
     """
     try:
         equations = ViewEquations.of(table, found)
