@@ -22,16 +22,18 @@ def resting_places(frames: Mapping[str, Sequence[Three]], least_moving: int, sha
 
     share: of a camera's frames that have a point there; more than half. None are at rest unless so many others move
     steadily in the usual frame of all cameras together: a pose has to be possible without those at rest, or the vehicle
-    may be at rest itself, among false points that are in other places in each frame. Source: ours.
+    may be at rest itself, among false points that are in other places in each frame. None of a camera are whose usual
+    frame has no steady motion elsewhere: far from it, its spots may hardly move. Source: ours.
     """
     out: dict[str, Array] = {}
     moving = np.zeros(max(map(len, frames.values()), default=0))
     for name, threes in frames.items():
         every = np.concatenate([NOWHERE, *(here for _, here, _ in threes)])
         count = sum((at_places(every, here).astype(int) for _, here, _ in threes), np.zeros(len(every), int))
-        out[name] = every[count >= share * len(threes)]
-        for k, three in enumerate(threes):
-            moving[k] += _steady(*(uv[~at_places(uv, out[name])] for uv in three))
+        places = every[count >= share * len(threes)]
+        steady = [_steady(*(uv[~at_places(uv, places)] for uv in three)) for three in threes]
+        moving[: len(steady)] += steady
+        out[name] = places if steady and np.median(steady) > 0 else NOWHERE
     if len(moving) >= _FEWEST_FRAMES and np.median(moving) >= least_moving:
         return out
     return dict.fromkeys(frames, NOWHERE)

@@ -36,3 +36,9 @@ def test_spots_that_creep_are_no_lamps_although_false_points_are_elsewhere_in_ea
 def test_a_vehicle_at_rest_beside_lamps_is_not_at_rest_itself():
     lamps = np.random.default_rng(3).uniform([0, 0], SIZE, (12, 2))
     assert not len(resting_places({"left": threes(0.0, lamps, 0)}, 4, 0.55)["left"])
+
+
+def test_spots_that_hardly_move_before_a_distant_camera_are_no_lamps():
+    """Another camera saw the same vehicle move: the distant one lost all its spots as lamps."""
+    views = {"far": threes(0.02, SPOTS[:0], 3), "near": threes(2.0, SPOTS[:0], 3)}
+    assert not any(len(places) for places in resting_places(views, 4, 0.55).values())

@@ -18,7 +18,6 @@ from lab.findings.finding import Level, verdict
 from tests.calibration.lens.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
 
 FIVE = IntrinsicsOptions(lens=LensModel(5))
-FIVE = replace(FIVE)
 QUICK = IntrinsicsOptions(lens=LensModel(4), warp=False)  # the true k3 is too small to be significant
 
 

@@ -54,7 +54,7 @@ def test_few_photographs_of_a_wide_rational_lens_give_that_lens():
 
 def test_corners_that_the_start_cannot_predict_are_found_again():
     """The start of the plain lens folds before the outermost corner of a wide rational one."""
-    table = photographs(Scene(lens=RATIONAL, views=6, distance_m=(0.12, 0.3)), 4)
+    table = photographs(Scene(lens=RATIONAL, views=6, distance_m=(0.08, 0.2)), 17)
     model, values = start(table, False)
     with np.errstate(invalid="ignore"):
         away = term_of(table, np.ones(len(table), dtype=bool), False).project(values) - table.pixels

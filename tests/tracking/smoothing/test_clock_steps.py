@@ -21,6 +21,13 @@ def test_a_long_first_step_is_shortened_and_negligible_ones_are_not_taken():
     np.testing.assert_array_equal(clock_step(solution(0.9 * SIGMA_S), PRIOR_S, MAX_CLOCK_STEPS), 0.0)
 
 
+def test_turns_that_change_with_each_step_do_not_keep_the_clocks_moving():
+    """Steps of .2 to .4 sigmas went on until turns became others: a step of three sigmas, and nothing was known."""
+    short = solution(0.4 * SIGMA_S)
+    for step in range(MAX_CLOCK_STEPS):
+        np.testing.assert_allclose(clock_step(short, PRIOR_S, step), (step < 2) * 0.4 * SIGMA_S)
+
+
 @pytest.mark.parametrize("step", range(MAX_CLOCK_STEPS + 1))
 def test_from_the_third_step_on_a_step_longer_than_its_sigma_allows_leaves_nothing_known(step):
     """A turntable's turns and the clocks followed each other for steps of five sigmas each, to 83 sigmas."""

@@ -19,7 +19,9 @@ from tracking.smoothing.motion.run_detections import ClockSolution, Reference, U
 DETERMINED = 0.3  # of the prior's sigma: a number whose sigma is larger keeps its prior
 MAX_CLOCK_STEPS = 4  # after each estimate of the motion
 _LONGEST_STEP = 0.5  # of a prior's sigma: a longer step is not linear
-_NEGLIGIBLE_STEP = 0.05  # of its sigma: a shorter step of a clock is not taken
+# Of its sigma: a shorter step of a clock is not taken; the second number from the third step on, which a linear problem
+# does not take: turns that change with each step would move the clocks without end.
+_NEGLIGIBLE_STEPS = 0.05, 0.5
 # The third of these steps or a later one, and the last, of a number whose sigma is below DETERMINED: longer than so
 # many of its sigmas, or than this share of its prior's. Then nothing is known of any: a linear problem takes one step.
 _FIRST_SMALL, _UNSETTLED_SIGMAS, _UNSETTLED_SHARE = 2, (3.0, 1.0), 0.3
@@ -119,7 +121,7 @@ def clock_step(found: ClockSolution, prior_sigma_s: Array, step: int) -> Array |
     long = away > np.minimum(most, _UNSETTLED_SHARE * prior_sigma_s)
     if step >= _FIRST_SMALL and np.any(long & (sigma < DETERMINED * prior_sigma_s)):
         return None
-    if step == MAX_CLOCK_STEPS or np.all(away < _NEGLIGIBLE_STEP * sigma):
+    if step == MAX_CLOCK_STEPS or np.all(away < _NEGLIGIBLE_STEPS[int(step >= _FIRST_SMALL)] * sigma):
         return np.zeros(len(sigma))
     longest = _LONGEST_STEP * prior_sigma_s
     return np.asarray(np.clip(found.correction_s, -longest, longest))

@@ -37,8 +37,8 @@ from tracking.smoothing.motion.run_detections import (
 from tracking.smoothing.motion.turns import (
     LEAST_LENGTH,
     LEAST_SHARE,
-    RESOLVED_NATS,
     TurnSearch,
+    resolved_nats,
     successions,
     unresolved,
     velocity_jumps,
@@ -254,7 +254,7 @@ class _TimedEstimator(_Estimator):
         for some in successions(self.turns, self.frame_s):
             jerk: Array | None = None
             if len(some) >= FEWEST and self._shown(some):
-                jerk = search.without(some, self.turns, -RESOLVED_NATS)
+                jerk = search.without(some, self.turns, -resolved_nats(some, self.frame_s))
             if jerk is not None:
                 smooth = [t for t in smooth if not any(t is each for each in some)]
                 density = np.maximum(density, jerk)

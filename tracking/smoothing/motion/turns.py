@@ -50,12 +50,12 @@ _CURVATURE_NATS = 0.5  # drop of the likelihood from which the sigma of the midd
 _CHANGED = 0.02, 0.1  # of a frame, and relative: less does not change a turn
 TURN_NATS = 3.0  # by which each turn must make a run more likely
 GAINED_NATS = 2 * TURN_NATS  # by which a jerk must be more likely than turns: two have as many numbers as it has axes
-RESOLVED_NATS = 40.0  # by which turns must be more likely than one smooth turn, or a jerk, in their place
+# For each turn, by which several must be more likely than one smooth turn, or a jerk, in their place: the more there
+# are, the better they approximate any smooth motion. So many frames between two turns show how it goes on in between.
+_RESOLVED_NATS, _SHOWN_BETWEEN = 20.0, 2.0
 _UNRESOLVED = 4.0  # frames: turns farther apart do not resemble one
-_WIDTHS, _SIZES = (
-    np.array([1.0, 1.3, 1.7]),
-    (0.3, 1.0, 3.0, 10.0),
-)  # of their distance and variances: one in their place
+_WIDTHS = np.array([1.0, 1.3, 1.7])  # of the distance of some turns: the lengths of one in their place ...
+_SIZES = (0.3, 1.0, 3.0, 10.0)  # ... and of their variances: its sizes
 _CLOSE = 3.0  # frames between two turns in close succession
 _JERKS = 10.0 ** np.arange(-4, 2)  # of the jerk that changes the velocities as much within a frame
 _JERK_STEPS, _GAINED_BY_STEP = 20, 1.0  # from there, and nats that each must gain
@@ -183,7 +183,7 @@ class TurnSearch:
         lengths = _WIDTHS * (end - begin)
         tried = [Turn(0.5 * (begin + end), length, length, k * size) for length in lengths for k in _SIZES]
         nats = [run.nats([one]) for one in tried]
-        return tried[int(np.argmax(nats))] if max(nats) > run.nats(short) - RESOLVED_NATS else None
+        return tried[int(np.argmax(nats))] if max(nats) > run.nats(short) - resolved_nats(some, self.frame_s) else None
 
     def largest(self, turn: Turn, all_turns: Sequence[Turn]) -> Turn:
         """A turn as large as the spots allow: slow motion hardly shows its size."""
@@ -344,11 +344,16 @@ def unresolved(turns: Sequence[Turn], frame_s: float) -> list[list[Turn]]:
     return [some for some in out if len(some) > 1]
 
 
-def successions(turns: Sequence[Turn], frame_s: float) -> list[list[Turn]]:
-    """Turns, by time, in groups of those in close succession."""
+def resolved_nats(some: Sequence[Turn], frame_s: float) -> float:
+    """By which turns must be more likely than a smooth motion in their place; at least as for two."""
+    return _RESOLVED_NATS * max(2, *map(len, successions(some, frame_s, _SHOWN_BETWEEN)))
+
+
+def successions(turns: Sequence[Turn], frame_s: float, apart: float = _CLOSE) -> list[list[Turn]]:
+    """Turns, by time, in groups of those in close succession: apart (frames) between neighbours at most."""
     out = list[list[Turn]]()
     for turn in turns:
-        if out and turn.begin_s - out[-1][-1].end_s < _CLOSE * frame_s:
+        if out and turn.begin_s - out[-1][-1].end_s < apart * frame_s:
             out[-1].append(turn)
         else:
             out.append([turn])
