@@ -19,6 +19,7 @@ from tracking.rigid_body.acquisition import Acquisition
 from tracking.rigid_body.rigid_tracker import RigidTracker
 from tracking.statuses import PoseStatus, TrackedFrame
 
+
 def two_beams(focal_px: float, angle_deg: float = 5.0) -> Rig:
     """Two beams 10 deg apart with both ends visible on screens 2.5 m away on either side: spots 44 cm apart.
 
