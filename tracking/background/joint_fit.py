@@ -36,7 +36,7 @@ UNLIKE = 0.1  # usual sigma of the modulated share of different places
 _DARKEST = 0.1  # of the usual light: what is left of it on black ground, at least
 _ROUNDS = 2  # of the texture's size and the fit
 _LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # sigmas of the noise
-_ALIKE = 2.0  # texture is alike over some pixels: fewer of them are independent
+_ALIKE = 2.0  # root of the number of pixels, at least, over which texture is alike; on an edge of an object it is more
 _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
 _LEAST_SHOWN = 1e-3  # share of the information on the modulation
@@ -290,10 +290,23 @@ def fitted(
     for _ in range(_ROUNDS):
         light = _descended(pixels, light)
         seen = pixels.seen(light)
-        texture_dn = float(np.std(pixels.structure(light, seen)))
-        light = replace(light, texture_dn=_ALIKE * max(texture_dn, _LEAST_TEXTURE * noise_dn))
+        structure = pixels.structure(light, seen)
+        alike = max(_alike_px(uv, structure), _ALIKE)
+        light = replace(light, texture_dn=alike * max(float(np.std(structure)), _LEAST_TEXTURE * noise_dn))
     light = _descended(pixels, light)
     return _checked(pixels, light, width_px)
+
+
+def _alike_px(uv: Array, structure: Array) -> float:
+    """Root of the number of pixels over which a structure (m,) is alike, by the correlation of neighbours."""
+    columns, rows = (np.unique(x, return_inverse=True)[1] for x in uv.T)
+    grid = np.full((rows.max() + 1, columns.max() + 1), np.nan)
+    grid[rows, columns] = structure - structure.mean()
+    area, total = 1.0, float(np.nanmean(grid**2))
+    for one, other in ((grid[:, 1:], grid[:, :-1]), (grid[1:], grid[:-1])):
+        r = min(max(float(np.nanmean(one * other)) / total, 0.0), 0.95)
+        area *= (1 + r) / (1 - r)
+    return float(np.sqrt(min(area, len(structure) / 4)))
 
 
 def _descended(pixels: _Pixels, light: JointLight) -> JointLight:
