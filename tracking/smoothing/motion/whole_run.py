@@ -46,6 +46,7 @@ NATS_PER_JUMP = 3.0  # by which a motion without jumps must be likelier: in doub
 CONVERGED_SIGMAS = 0.02  # a Gauss-Newton step below this is negligible
 CONVERGED_LOG_DENSITY = 0.3  # change of log q, weighted by its determined components, below which the strength is kept
 DAMPING = (np.inf, 0.1, 0.01, 1e-3)  # m and rad: tried in turn until the cost falls; inf: none
+MAX_CORRECTIONS = 3  # steps that may follow a step before the cost has fallen
 PARTIAL_WEIGHT = 0.25  # of the spots of a frame that does not determine the pose
 P_JUMP_OUTSIDE = 0.15  # probability of a velocity jump in each frame that is extrapolated
 MAX_DISTANCE = 12  # frames: spots farther from any measured frame are not used
@@ -225,13 +226,34 @@ class _Estimator:
         out = smoothed(self.ref, info, density, tested)
         for damping in DAMPING:
             x = out.x if np.isinf(damping) else smoothed(self.ref, _damped(info, damping), density, tested=False).x
-            if not np.isfinite(x).all():
-                continue
-            moved = shifted(self.ref, x)
-            if 0.5 * float(self._spot_information(moved)[2].sum()) + motion_cost(moved, info, density) <= limit:
+            moved = self._corrected(x, info, damping, density, limit)
+            if moved is not None:
                 self.ref = moved
                 return out, x
         return out, np.zeros_like(out.x)
+
+    def _corrected(
+        self, x: Array, info: RunInformation, damping: float, density: Array, limit: float
+    ) -> Reference | None:
+        """The reference moved by x (T, 18), corrected until its cost is below the limit; None where it stays above.
+
+        Where the jerk is weak, as of a vehicle at rest between steps, the motion is nearly a constraint. The curvature
+        of that constraint, which a linear step misses, then costs more than the step gains, however short it is, and a
+        further step removes it (Maratos effect; the remedy is the second-order correction, e.g. Nocedal & Wright,
+        "Numerical Optimization", sections 15.4 and 18.3). The jump variances stay those of the step.
+        """
+        moved = self.ref
+        for correction in range(MAX_CORRECTIONS + 1):
+            if correction > 0:
+                L, g, _ = self._spot_information(moved)
+                x = smoothed(moved, _damped(info._replace(information=L, vector=g), damping), density, tested=False).x
+            if not np.isfinite(x).all():
+                return None
+            moved = shifted(moved, x)
+            cost = 0.5 * float(self._spot_information(moved)[2].sum()) + motion_cost(moved, info, density)
+            if cost <= limit:
+                return moved
+        return None
 
     def _information(self, ref: Reference) -> tuple[RunInformation, float]:
         """The frames' information at a reference, with the allowed velocity jumps; and the spots' chi-square."""
