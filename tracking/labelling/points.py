@@ -31,33 +31,18 @@ class Points(NamedTuple):
     first: Ints  # (cameras + 1,) row of the first point of each camera
     row: Ints  # (m,) row in that camera's detections
     log_density: Array  # (cameras,) log of the density of all points, 1/px^2
-    log_clear: Array  # (m,) see `log_clear`
     log_unused: Array  # (cameras, most + 1): see `_log_unused`
 
 
-def _clearest_first(found: Detections) -> tuple[Ints, bool]:
+def _clearest_first(found: Detections) -> Ints:
     """The rows of points, by signal to noise: their width over the sigma of their centre; otherwise by flux.
 
     Objects in front of which a spot shines are often brighter than it, but no Gaussian: their centre is uncertain. The
-    flux counts where widths are unknown or all sigmas are the same; the second result says whether they are known.
+    flux counts where widths are unknown or all sigmas are the same.
     """
     clear = found.major_px * found.minor_px / found.variance_px2
-    measured = bool(len(found) > 1 and np.isfinite(clear).all() and np.ptp(found.variance_px2) > 0)
-    return np.argsort(-(clear if measured else np.nan_to_num(found.flux, nan=0.0)), kind="stable"), measured
-
-
-def log_clear(found: Detections) -> Array:
-    """Log-likelihood ratio (m,), nats, of spots to false points by the order of signal to noise; 0 if not measured.
-
-    Spots are among the clearest points of a picture, before edges and texture: the r-th one is a spot with a
-    probability in proportion to 1 / r, and any of the m points is equally likely to be a given false one.
-    """
-    order, measured = _clearest_first(found)
-    out = np.zeros(len(found))
-    if measured:
-        rank = np.arange(1, len(found) + 1)
-        out[order] = np.log(len(found) / (rank * np.sum(1 / rank)))
-    return out
+    measured = len(found) > 1 and np.isfinite(clear).all() and np.ptp(found.variance_px2) > 0
+    return np.argsort(-(clear if measured else np.nan_to_num(found.flux, nan=0.0)), kind="stable")
 
 
 def points_of(
@@ -73,7 +58,7 @@ def points_of(
     """
     cameras = len(model.camera_names)
     uv, cov, world, row = [np.zeros((0, 2))], [np.zeros((0, 2, 2))], [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)]
-    m_per_px, clear = [np.zeros(0)], [np.zeros(0)]
+    m_per_px = [np.zeros(0)]
     first = np.zeros(cameras + 1, dtype=np.int64)
     log_density = np.zeros(cameras)
     log_unused = np.zeros((cameras, len(model) + 1))
@@ -83,7 +68,7 @@ def points_of(
         if found is not None and len(found):
             camera = rig.cameras[name]
             screen = rig.screens[camera.screen]
-            order, _ = _clearest_first(found)
+            order = _clearest_first(found)
             if len(found) > parameters.max_points:
                 origin, rays = camera.rays(found.uv_px[order])
                 possible = np.flatnonzero(
@@ -100,9 +85,6 @@ def points_of(
             hits = intersect_surface(origin, rays, screen.world_from_screen, screen.bow)
             uv.append(here)
             cov.append(found.cov_px2[clearest])
-            among = np.zeros(len(found))
-            among[order] = log_clear(found[order])
-            clear.append(among[clearest])
             world.append(hits[0])
             m_per_px.append(np.linalg.norm(hits[1:] - hits[0], axis=-1).max(axis=0))
             row.append(clearest)
@@ -120,7 +102,6 @@ def points_of(
         first,
         np.concatenate(row).astype(np.int64),
         log_density,
-        np.concatenate(clear),
         log_unused,
     )
 

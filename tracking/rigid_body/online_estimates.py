@@ -12,7 +12,6 @@ from geometry.arrays import Array, Bools, Ints
 from geometry.compilation.jit import compiled
 from geometry.forward_model import SpotModel
 from tracking.detections import Detections
-from tracking.labelling.points import log_clear
 from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED, CLUTTER_RADIUS_PX, FrameDetections
 from tracking.rigid_body.frame_summary import FrameSummary
@@ -296,18 +295,13 @@ class PointStatistics:
         if any(f.at_rest is not None for f in some):
             at_rest = np.concatenate([np.zeros(len(f)) if f.at_rest is None else f.at_rest for f in some]) > 0
             static[at_rest] = np.maximum(static[at_rest], SURE_LOG_DENSITY)
-        elsewhere = static == -np.inf  # at no static place
-        log_clutter, log_excess = self._clutter.log_density(np.concatenate([[0], np.cumsum(elsewhere)])[first_rows])
-        clear = np.zeros(len(uv))
+        elsewhere = np.concatenate([[0], np.cumsum(static == -np.inf)])[first_rows]  # those at no static place
+        log_clutter, log_excess = self._clutter.log_density(elsewhere)
         if first:
             # The excess of clutter near spots must not make points without any spot evidence of a vehicle.
             log_clutter, log_excess = log_clutter - log_excess, np.zeros_like(log_excess)
-            for f, begin, end in zip(found, first_rows[:-1], first_rows[1:], strict=True):
-                if f is not None:
-                    own = np.flatnonzero(elsewhere[begin:end])
-                    clear[begin + own] = log_clear(f[own])
         return FrameDetections(
-            uv, cov, blend, first_rows, has_image, log_clutter, static, major, self._usual_size_px, log_excess, clear
+            uv, cov, blend, first_rows, has_image, log_clutter, static, major, self._usual_size_px, log_excess
         )
 
     def update(self, frame: FrameDetections, assigned: Ints, summary: FrameSummary, measured: bool) -> None:

@@ -43,17 +43,7 @@ def evidence_of(step_px: float, nats: float = 3.0, frames: int = 20) -> float:
     for k in range(frames):
         uv = start + step_px * k + rng.normal(0.0, 0.1, (n, 2))
         frame = FrameDetections(
-            uv,
-            COV,
-            views,
-            np.array([0, n]),
-            np.ones(1, dtype=bool),
-            views,
-            np.full(n, -np.inf),
-            views,
-            views,
-            views,
-            views,
+            uv, COV, views, np.array([0, n]), np.ones(1, dtype=bool), views, np.full(n, -np.inf), views, views, views
         )
         assert evidence.add(frame, np.arange(n), nats, continued=k > 0)
     return evidence.nats
@@ -69,6 +59,6 @@ def test_small_evidence_against_a_vehicle_adds_up_at_rest_as_well():
     evidence = FirstEvidence(len(MODEL))
     n, views = len(MODEL), np.zeros(len(MODEL))
     frame = FrameDetections(
-        np.zeros((n, 2)), COV, views, np.array([0, n]), np.ones(1, dtype=bool), views, views, views, views, views, views
+        np.zeros((n, 2)), COV, views, np.array([0, n]), np.ones(1, dtype=bool), views, views, views, views, views
     )
     assert [evidence.add(frame, np.arange(n), -2.0, continued=k > 0) for k in range(3)] == [True, True, False]
