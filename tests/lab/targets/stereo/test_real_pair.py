@@ -51,8 +51,8 @@ def test_the_baseline_is_that_of_opencvs_stereo_calibration(outcome, corners):
     found = cv2.stereoCalibrate(
         objects, left, right, first[1], first[2], second[1], second[2], (640, 480), flags=0
     )  # fmt: skip
-    assert outcome.pair.baseline_m == pytest.approx(float(np.linalg.norm(found[6])), abs=0.0005)
-    assert max(outcome.pair.rms_px) < 0.2
+    assert outcome.result.baseline_m == pytest.approx(float(np.linalg.norm(found[6])), abs=0.0005)
+    assert max(outcome.result.rms_px) < 0.2
 
 
 def test_triangulated_corners_are_on_the_squares_of_the_board(outcome, corners):
