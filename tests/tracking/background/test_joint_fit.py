@@ -253,3 +253,15 @@ def test_ground_whose_structure_is_no_more_than_its_noise_hardly_shows_how_it_mo
         modulated = 0.4 * fit.level_dn / 60.0
         off.append((share - modulated / (0.6 + modulated)) / np.sqrt(variance))
     assert np.sqrt(np.mean(np.square(off))) < 1.5
+
+
+def test_a_plane_says_less_of_an_edge_than_of_grain_that_is_as_strong():
+    """Of an edge all pixels err from a plane together, of grain each by itself."""
+    at = places(5.0)
+    about = np.column_stack([UV, np.ones(len(UV))])
+    rough = EDGE.ravel() - about @ np.linalg.lstsq(about, EDGE.ravel(), rcond=None)[0]
+    grain = EDGE.mean() + np.random.default_rng(5).permutation(rough).reshape(EDGE.shape)
+    of_edge, of_grain = (fit_of(pictures(at, ground, 0.3), at + OFF) for ground in (EDGE, grain))
+    assert of_edge is not None
+    assert of_grain is not None
+    assert of_edge.light.texture_dn > 2.0 * of_grain.light.texture_dn
