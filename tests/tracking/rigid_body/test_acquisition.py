@@ -81,7 +81,7 @@ def test_long_lenses_find_a_vehicle_of_four_spots_among_many_points_at_rest_from
     """Its spots are shown by a thousandth of the prior's poses. Points at rest alone are never a vehicle."""
     rig = two_beams(25000.0, 1.0)
     prior = PosePrior(Pose.identity(), 1.5, np.deg2rad(20.0))
-    for seed in range(4):
+    for seed in range(4 if spots else 1):  # searches that find nothing take long
         rng = np.random.default_rng([seed, 2])
         at = Pose.from_ypr(np.deg2rad([0.4, 0.2, 0.4]) * rng.uniform(-1, 1, 3), 0.02 * rng.uniform(-1, 1, 3))
         sway = np.deg2rad(0.3) * np.sin(2 * np.pi * 0.4 * np.arange(12) / 75.0)
