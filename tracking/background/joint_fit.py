@@ -10,9 +10,9 @@ percent, since lasers flicker (1, unless the pictures were scaled to equal light
 surface whose own brightness is B, so the surface modulates it: q > 0. B is linear in this equation and is eliminated at
 each pixel; p, q, the size, the strengths and the places c_k are found by Gauss-Newton steps. A bright light is so
 determined to a few hundredths of a pixel by a motion of half its width, on any background. What the motion leaves open
-is decided by a plane: B differs from it by as much as the found background does. Source: ours; the elimination is the
-variable projection of Golub & Pereyra (1973), SIAM J. Numer. Anal. 10, 413, in the approximation of Kaufman (1975), BIT
-15, 49.
+is decided by the ground beside the light: B lies as near to its plane as that does, except beyond edges, of which the
+plane says nothing. Source: ours; the elimination is the variable projection of Golub & Pereyra (1973), SIAM J. Numer.
+Anal. 10, 413, in the approximation of Kaufman (1975), BIT 15, 49.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from geometry.arrays import Array
+from geometry.arrays import MEDIAN_TO_SIGMA, Array
 
 _STEPS, _TRIES = 30, 8  # limits: steps of the fit, and shorter trials of each
 _CONVERGED = 1e-5  # relative decrease of the cost
@@ -36,7 +37,11 @@ UNLIKE = 0.1  # usual sigma of the modulated share of different places
 _DARKEST = 0.1  # of the usual light: what is left of it on black ground, at least
 _ROUNDS = 2  # of the texture's size and the fit
 _LEAST_TEXTURE, _FIRST_TEXTURE = 2.0, 20.0  # sigmas of the noise
-_ALIKE = 2.0  # root of the number of pixels, at least, over which texture is alike; on an edge of an object it is more
+_EDGE = 3.0  # sigmas of the ground around a light: what differs from its plane by more is another surface
+_BESIDE = 0.1  # of the light: pixels with less of it show the ground around it
+_UNKNOWN = 10.0  # sigma of another surface, in differences from the plane: that says nothing of it
+_PLANES = 10  # fits of the plane, from which pixels on edges count less and less
+_ALIKE = 2.0  # root of the number of pixels, at least, over which texture is alike
 _LARGEST_CHI2 = 2.0  # per degree of freedom
 _LARGEST_SIGMA = 0.1  # of the mean place, in widths of the light
 _LEAST_SHOWN = 1e-3  # share of the information on the modulation
@@ -94,7 +99,7 @@ class JointLight:
     modulated: float  # q, no unit
     plane: Array  # (3,): the background's, DN and DN per px, about `origin`
     origin: Array  # (2,) px
-    texture_dn: float  # sigma of the background about the plane
+    texture_dn: Array  # (m,): sigma of the background about the plane, in the pixels that were fitted
     strength: Array  # (n, 1)
 
     @property
@@ -177,7 +182,7 @@ class _Pixels:
         own = np.column_stack([np.tile(np.arange(5), (n, 1)), 5 + 2 * each, 6 + 2 * each, size - n + each])
         by_plane = -np.stack([np.ones(m), *(self.uv - light.origin).T]) / light.texture_dn
         # The residuals have no part along the background's slopes: it is the best one for this light.
-        by_background = np.concatenate([seen.slope * seen.root, np.full((1, m), 1 / light.texture_dn)])
+        by_background = np.concatenate([seen.slope * seen.root, 1 / light.texture_dn[None]])
         by_background /= np.sqrt(seen.information)
         along = slopes * by_background[:n, None]
         eliminated = np.zeros((size, m))
@@ -227,6 +232,7 @@ class JointFit:
     """A light of which the fit explains the pictures."""
 
     light: JointLight
+    uv: Array  # (m, 2) px: the pixels of the fit
     share: float  # variance of the errors that its places share, over that of one of them by the noise of its picture
     strength_cov: Array  # (2, 2): of p and q
     level_dn: float  # DN above black, of the ground
@@ -255,7 +261,8 @@ class JointFit:
         them.
         """
         pixels = _Pixels(uv, values, variance, 1.0, self.light.plain, MODULATED, *empty, self.light.strength)
-        seen = pixels.seen(self.light)
+        texture_dn = self.light.texture_dn[cKDTree(self.uv).query(uv)[1]]
+        seen = pixels.seen(replace(self.light, texture_dn=texture_dn))
         return seen.behind, seen.information * variance.mean(axis=0), seen.light_of.max(axis=0)
 
 
@@ -284,29 +291,53 @@ def fitted(
     origin, inverse, noise_dn = uv.mean(axis=0), 1 / width_px, float(np.sqrt(np.median(variance)))
     light = JointLight(
         places, np.array([inverse, 0.0, inverse]), (1 - expected[0]) * height_dn,
-        expected[0] * height_dn / pixels.usual, np.array([usual, 0.0, 0.0]), origin, _ALIKE * _FIRST_TEXTURE * noise_dn,
-        strength,
+        expected[0] * height_dn / pixels.usual, np.array([usual, 0.0, 0.0]), origin,
+        np.full(len(uv), _ALIKE * _FIRST_TEXTURE * noise_dn), strength,
     )  # fmt: skip
     for _ in range(_ROUNDS):
         light = _descended(pixels, light)
-        seen = pixels.seen(light)
-        structure = pixels.structure(light, seen)
-        alike = max(_alike_px(uv, structure), _ALIKE)
-        light = replace(light, texture_dn=alike * max(float(np.std(structure)), _LEAST_TEXTURE * noise_dn))
+        light = _before_ground(light, uv, pixels.seen(light), noise_dn)
     light = _descended(pixels, light)
     return _checked(pixels, light, width_px)
 
 
+def _before_ground(light: JointLight, uv: Array, seen: _Seen, noise_dn: float) -> JointLight:
+    """The light before the plane of the ground beside it, with what that says of each pixel (m, 2) behind the light."""
+    lit = seen.light_of.max(axis=0)
+    beside = np.where(lit < _BESIDE, np.sqrt(lit), 0.0)  # most of what is nearest
+    if not beside.any():
+        return light  # it has left the pixels
+    about = np.column_stack([np.ones(len(uv)), uv - light.origin])
+    plane = np.array([_median(seen.behind, beside), 0.0, 0.0])
+    for _ in range(_PLANES):
+        left = seen.behind - about @ plane
+        usual = max(MEDIAN_TO_SIGMA * _median(np.abs(left), beside), _LEAST_TEXTURE * noise_dn)
+        weighted = about * (beside / (1 + (left / usual) ** 2))[:, None]
+        plane = np.asarray(np.linalg.lstsq(weighted.T @ about, weighted.T @ seen.behind, rcond=None)[0], float)
+    left = seen.behind - about @ plane
+    other = np.abs(left) > _EDGE * usual
+    alike = max(_alike_px(uv, np.where((beside > 0) & ~other, left, np.nan)), _ALIKE)
+    return replace(light, plane=plane, texture_dn=alike * np.where(other, _UNKNOWN * np.abs(left), usual))
+
+
+def _median(values: Array, weight: Array) -> float:
+    return float(np.quantile(values, 0.5, weights=weight, method="inverted_cdf"))
+
+
 def _alike_px(uv: Array, structure: Array) -> float:
-    """Root of the number of pixels over which a structure (m,) is alike, by the correlation of neighbours."""
+    """Root of the number of pixels over which a structure (m,), NaN elsewhere, is alike, by the correlation of
+    neighbours."""
     columns, rows = (np.unique(x, return_inverse=True)[1] for x in uv.T)
     grid = np.full((rows.max() + 1, columns.max() + 1), np.nan)
-    grid[rows, columns] = structure - structure.mean()
-    area, total = 1.0, float(np.nanmean(grid**2))
-    for one, other in ((grid[:, 1:], grid[:, :-1]), (grid[1:], grid[:-1])):
-        r = min(max(float(np.nanmean(one * other)) / total, 0.0), 0.95)
+    grid[rows, columns] = structure - np.nanmean(structure)
+    known = np.isfinite(grid)
+    grid[~known] = 0.0
+    area, total = 1.0, float(np.mean(grid[known] ** 2))
+    for one, other in (np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]):
+        pairs = max(int(np.count_nonzero(known[one] & known[other])), 1)
+        r = min(max(float(np.sum(grid[one] * grid[other])) / (pairs * total), 0.0), 0.95)
         area *= (1 + r) / (1 - r)
-    return float(np.sqrt(min(area, len(structure) / 4)))
+    return float(np.sqrt(min(area, np.count_nonzero(known) / 4)))
 
 
 def _descended(pixels: _Pixels, light: JointLight) -> JointLight:
@@ -362,4 +393,5 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     lit = np.sum(seen.light_of**2, axis=0)
     structure2 = float(np.sum(lit * pixels.structure(light, seen) ** 2))
     noise_share = min(float(np.sum(lit / seen.information)) / max(structure2, 1e-300), 1.0)
-    return JointFit(light, float(shared / max(own, 1e-9)), strength_cov, pixels.usual, pixels.modulated, noise_share)
+    share = float(shared / max(own, 1e-9))
+    return JointFit(light, pixels.uv, share, strength_cov, pixels.usual, pixels.modulated, noise_share)

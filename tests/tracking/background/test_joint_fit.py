@@ -32,11 +32,11 @@ def places(length_px: float, pictures: int = 15) -> Array:
     return MIDDLE + np.linspace(-0.5, 0.5, pictures)[:, None] * length_px * np.array([0.6, 0.8])
 
 
-def pictures(at: Array, background: Array, modulated: float, seed: int = 1) -> Array:
+def pictures(at: Array, background: Array, modulated: float, seed: int = 1, width_px: float = WIDTH) -> Array:
     """(n, h, w), DN: a light whose share is modulated by the background, 1 where that is 60 DN."""
     rng = np.random.default_rng(seed)
     response = 1 - modulated + modulated * background / 60.0
-    light = [HEIGHT * np.exp(-0.5 * ((X - u) ** 2 + (Y - v) ** 2) / WIDTH**2) for u, v in at]
+    light = [HEIGHT * np.exp(-0.5 * ((X - u) ** 2 + (Y - v) ** 2) / width_px**2) for u, v in at]
     return np.array([background + response * one + NOISE * rng.standard_normal(X.shape) for one in light])
 
 
@@ -264,4 +264,16 @@ def test_a_plane_says_less_of_an_edge_than_of_grain_that_is_as_strong():
     of_edge, of_grain = (fit_of(pictures(at, ground, 0.3), at + OFF) for ground in (EDGE, grain))
     assert of_edge is not None
     assert of_grain is not None
-    assert of_edge.light.texture_dn > 2.0 * of_grain.light.texture_dn
+    assert (of_edge.light.texture_dn > 2.0 * of_grain.light.texture_dn).all()
+
+
+def test_a_light_on_an_even_square_is_placed_by_the_square_whatever_stands_beside_it():
+    """The light of a hole of its own shape in the ground, and more of its own, is no explanation of the pictures."""
+    inside = np.maximum(np.abs(X - MIDDLE), np.abs(Y - MIDDLE)) < 14.0
+    off = []
+    for seed in range(6):
+        at = places(1.5)
+        fit = fit_of(pictures(at, np.where(inside, 50.0, 10.0), 0.4, seed, 3.5), at + OFF)
+        assert fit is not None
+        off.append(fit.light.places - at)
+    assert np.sqrt(np.mean(np.square(off))) < 0.026
