@@ -282,11 +282,16 @@ def refined_with_true_labels(known: Rig, covariance: RigCovariance, scenes: list
     return RefinedRig(found, covariance, runs, checks)
 
 
-def rig_nees(refined: Refinement, true: Rig) -> tuple[float, int]:
-    """Mean squared error of the rig per number in sigmas of the result, and the count of numbers."""
+def rig_errors(refined: Refinement, true: Rig) -> Array:
+    """True minus refined numbers of the rig (p,)."""
     stacks = stacks_of(true)
     one = [stacks[n].pick(np.array([i])).minus(refined.values[n].pick(np.array([i])))[0] for n, i in refined.at]
-    white = np.linalg.lstsq(refined.after.root, np.concatenate(one), rcond=1e-12)[0]
+    return np.concatenate(one)
+
+
+def rig_nees(refined: Refinement, true: Rig) -> tuple[float, int]:
+    """Mean squared error of the rig per number in sigmas of the result, and the count of numbers."""
+    white = np.linalg.lstsq(refined.after.root, rig_errors(refined, true), rcond=1e-12)[0]
     return float(np.mean(white**2)), len(white)
 
 
@@ -406,17 +411,26 @@ def fourth(folder: Path, last: Scene, true: Rig, given: Scene, refined: Refineme
     poses = last.poses[both]
     raw = rms(ours[k][:, 3:]) / rms(best[i][:, 3:])
     a, b = without_frames(ours[k], poses), without_frames(best[i], poses)
-    ratios, expected = np.array([rms(a[:, n]) / rms(b[:, n]) for n in (np.s_[3:], np.s_[:3])]), []
-    for part, e in zip((np.s_[3:], np.s_[:3]), expected_errors(refined, last), strict=True):
-        expected.append(np.sqrt(1 + (e / rms(b[:, part])) ** 2))
+    ratios = np.array([rms(a[:, n]) / rms(b[:, n]) for n in ANGLE_AND_PLACE])
+    drawn, own = errors_by_rig(refined, last, true)
+    noise = np.array([rms(b[:, n]) for n in ANGLE_AND_PLACE])
+    expected, share = np.sqrt(1 + np.mean(drawn**2, axis=0) / noise**2), np.mean(drawn < own, axis=0)
     return (
         f", attitude ratio {ratios[0]:.3f} position {ratios[1]:.3f} (expected {expected[0]:.3f}, {expected[1]:.3f};"
+        f" the rig's errors cause more than {share[0]:.2f}, {share[1]:.2f} of draws of its covariance;"
         f" with conventions {raw:.1f}), NEES/6 {np.mean(nees):.3f}, frames {len(with_it)} of {len(at)}"
     )
 
 
-def expected_errors(r: Refinement, last: Scene) -> tuple[float, float]:
-    """RMS of attitude, rad, and position, m, that the rig's covariance causes in a recording, without conventions."""
+ANGLE_AND_PLACE = np.s_[3:], np.s_[:3]  # of pose errors
+_DRAWS = 200
+
+
+def errors_by_rig(r: Refinement, last: Scene, true: Rig) -> tuple[Array, Array]:
+    """RMS of attitude, rad, and position, m, that errors of the rig cause in a recording, without conventions.
+
+    Of draws of its covariance (d, 2), and of the rig's own errors (2,).
+    """
     recording = with_true_labels(last)
     free = {name: np.zeros((len(v), v.dof), dtype=bool) for name, v in r.values.items()}
     for stack, i in r.at:
@@ -425,10 +439,10 @@ def expected_errors(r: Refinement, last: Scene) -> tuple[float, float]:
     term = RecordingTerm(r.given, recording.at(frames), free)
     lin = term.reduced(r.values).lin
     D = lin.pose_shift(lin.W @ term._derivatives(SpotModel.of(rig_of(r.given, r.values)), lin, r.values))
-    draws = np.random.default_rng(1).normal(size=(20, r.after.root.shape[1])) @ r.after.root.T
-    errors = [without_frames(D @ e, last.poses[frames]) for e in draws]
-    angle, place = (float(np.sqrt(np.mean([rms(e[:, part]) ** 2 for e in errors]))) for part in (np.s_[3:], np.s_[:3]))
-    return angle, place
+    draws = np.random.default_rng(1).normal(size=(_DRAWS, r.after.root.shape[1])) @ r.after.root.T
+    errors = [without_frames(D @ e, last.poses[frames]) for e in (*draws, rig_errors(r, true))]
+    sizes = np.array([[rms(e[:, part]) for part in ANGLE_AND_PLACE] for e in errors])
+    return sizes[:-1], sizes[-1]
 
 
 def main() -> None:

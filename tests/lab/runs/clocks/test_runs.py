@@ -13,6 +13,8 @@ import pytest
 
 from bench.clocks.__main__ import Figures, figures
 from bench.clocks.recording import Recording, random_recording, write_recording
+from bench.random_scenes.write_folder import write_run_folder
+from bench.refine import campaign
 from geometry.arrays import Array
 from geometry.pose import Pose
 from lab.files.run.results import read_poses
@@ -20,6 +22,7 @@ from lab.runs.process import process_run
 from lab.simulate.write import simulate
 from tests.marks import further_slow
 from tracking.smoothing.motion.clocks import DETERMINED
+from tracking.smoothing.motion.interpolation import Interpolation
 from tracking.smoothing.smoother import _Smoother
 
 FRAMES, SEED = 40, 3
@@ -146,6 +149,20 @@ def test_smooth_motion_is_averaged_over_as_many_frames_as_with_one_clock(tmp_pat
     rms, rms_one = (np.sqrt(np.nanmean(f.attitude_deg[3:-3] ** 2)) for f in (own, one))
     assert rms < 1.1 * rms_one
     assert np.nanmean(own.nees) > 0.7
+
+
+@pytest.mark.usefixtures("no_search")
+def test_cameras_whose_own_spots_leave_the_pose_open_do_not_end_the_averaging(tmp_path, monkeypatch):
+    """Each instant has three spots of one camera: whether it counted as one of few spots was a matter of rounding."""
+    inside = list[float]()
+    monkeypatch.setattr(
+        Interpolation, "best_offset", lambda i, f=Interpolation.best_offset: inside.append(i.interior.mean()) or f(i)
+    )
+    lab, (scene,), _ = campaign(9975, frames=120, recordings=1, clocks_s=2e-3)
+    write_run_folder(replace(scene, known_rig=lab.rig), tmp_path / "run")
+    process_run(tmp_path / "run", tmp_path / "out")
+    assert inside
+    assert min(inside) > 0.7
 
 
 @pytest.mark.usefixtures("no_search")
