@@ -725,3 +725,47 @@ def test_a_batch_of_one_run_gives_the_tables_of_that_run(tmp_path):
     process_batch([folder], tmp_path / "many")
     for name in HEADERS:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "many/run" / name).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def three_cameras(tmp_path_factory) -> Path:
+    """Points of a rig whose third camera sees what the left one sees, with errors of its own."""
+    run_folder = simulate("huo2015", tmp_path_factory.mktemp("three") / "run", seed=3, frames=60, detections_only=True)
+    for name, key in (("rig.yaml", "cameras"), ("run.yaml", "cameras")):
+        content = yaml.safe_load((run_folder / name).read_text("utf-8"))
+        content[key]["third"] = dict(content[key]["left"])
+        (run_folder / name).write_text(yaml.safe_dump(content), "utf-8")
+    points = pd.read_csv(run_folder / "detections.csv")
+    third = points[points.camera == "left"].assign(camera="third")
+    third["u_px"] += np.random.default_rng(3).normal(0, third["sigma_u_px"])
+    pd.concat([points, third]).to_csv(run_folder / "detections.csv", index=False)
+    return run_folder
+
+
+@pytest.mark.parametrize(("seen", "text"), [("shifted", "third: in 30 frames (30 to 59)"), ("hidden", None)])
+def test_a_camera_that_moves_so_far_that_its_spots_lose_their_labels_is_named(three_cameras, tmp_path, seen, text):
+    """A knock during the recording. Where its spots are hidden, only false points remain, and it has not moved."""
+    run_folder = shutil.copytree(three_cameras, tmp_path / "run")
+    points = pd.read_csv(run_folder / "detections.csv")
+    late = (points.camera == "third") & (points.frame >= 30)
+    if seen == "shifted":
+        points.loc[late, "v_px"] += 70.0
+    else:
+        points = points[~late]
+    points.to_csv(run_folder / "detections.csv", index=False)
+    outcome = process_run(run_folder, tmp_path / "out")
+    assert outcome.result.measured == 60
+    moved = [f.what for f in outcome.verdict.findings if f.code == "BP-V19"]
+    assert [w for w in moved if text is None or text not in w] == []
+    assert len(moved) == (text is not None)
+
+
+def test_a_camera_whose_screen_gets_no_spot_is_used_without_a_warning(three_cameras, tmp_path, recwarn):
+    """Its points are false ones; their density divided by no area at all (once `divide by zero` in log_density)."""
+    run_folder = shutil.copytree(three_cameras, tmp_path / "run")
+    content = yaml.safe_load((run_folder / "rig.yaml").read_text("utf-8"))
+    content["screens"]["floor"] = content["screens"]["left"]
+    content["cameras"]["third"] = content["cameras"]["third"] | {"screen": "floor"}
+    (run_folder / "rig.yaml").write_text(yaml.safe_dump(content), "utf-8")
+    assert process_run(run_folder, tmp_path / "out").result.measured == 60
+    assert not recwarn.list
