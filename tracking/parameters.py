@@ -2,12 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
+
+_SHARES = frozenset({"p_detect", "p_blend", "p_manoeuvre", "min_label_probability", "min_explained"})  # at most 1
+
+
+class _InRange:
+    """Parameters whose numbers are 0 or more, whose counts are 1 or more, and whose probabilities are at most 1."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: the first number outside its range."""
+        for one in fields(self):  # type: ignore[arg-type]  # of the dataclasses below
+            value = getattr(self, one.name)
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                continue
+            least, most = int(one.type == "int"), 1.0 if one.name in _SHARES else float("inf")
+            if not least <= value <= most:
+                expected = f"a number from {least} to {most:g}" if most == 1 else f"a number of {least} or more"
+                raise ValueError(f"{one.name}: expected {expected}, got {value!r}")
 
 
 @dataclass(frozen=True, slots=True)
-class DetectParameters:
+class DetectParameters(_InRange):
     """Finding and measuring points of light in one picture (tracking/detection)."""
 
     threshold_sigma: float = 6.0  # detection threshold above the local background, in sigmas of its noise
@@ -19,7 +38,7 @@ class DetectParameters:
 
 
 @dataclass(frozen=True, slots=True)
-class LabelParameters:
+class LabelParameters(_InRange):
     """Labels without a track: the first frame and after a blackout (tracking/labelling/first_labels.py)."""
 
     model_sigma_px: float = 0.3  # px: 1-sigma error of the calibrated model, in addition to every point's own sigma
@@ -34,7 +53,7 @@ class LabelParameters:
 
 
 @dataclass(frozen=True, slots=True)
-class TrackerParameters:
+class TrackerParameters(_InRange):
     """Tracking (rigid_tracker.py, spot_tracker.py). Symbols: Huo, Yang & Yang 2015, sections 3 and 4.1."""
 
     # rigid: one filter for the vehicle with all spots | spots: the paper's method, a filter per spot

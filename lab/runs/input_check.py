@@ -300,7 +300,7 @@ def _why_size(reason: str) -> str:
     width, height, right_width, right_height = (int(n) for n in re.findall(r"\d+", reason)[:4])
     if (width, height) == (right_height, right_width):
         return "turned by 90 deg, or transposed (rows and columns exchanged)?"
-    if width * right_height == height * right_width:
+    if abs(width * right_height - height * right_width) <= max(right_width, right_height):  # halves are rounded
         return f"recorded with {width / right_width:.3g} times the resolution of the calibration?"
     if width <= right_width and height <= right_height:
         return "cropped?"

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from geometry.forward_model import SpotModel
-from geometry.pose import Pose
-from geometry.rotations import log
 from lab.files.rig.camera_file import require_valid_calibration
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.results import SUMMARY_SCHEMA, ResultFolder, are_results
@@ -115,25 +113,9 @@ def _notes(pipeline: Pipeline, statistics: RunStatistics) -> list[str]:
         notes.append(f"cameras of the rig without data in this run: {', '.join(pipeline.run.left_out)}")
     if unlisted := statistics.events.unlisted:
         notes.append(f"events: the first {MOST_EVENTS} of {MOST_EVENTS + unlisted} are listed")
-    at_start = statistics.first_measured == statistics.first_frame
-    if away := _away_from_prior(pipeline.run, statistics.first_pose if at_start else None):
-        notes.append(away)
     if outside := pipeline.run.paths_outside:
         notes.append(f"read from outside the run folder: {', '.join(map(str, outside))}")
     return notes
-
-
-def _away_from_prior(run: Run, pose: Pose | None) -> str:
-    """A note where the measured pose of the first frame is outside the prior that run.yaml states; otherwise empty."""
-    if run.prior is None or pose is None or run.prior.contains(pose):
-        return ""
-    away_m = float(np.abs(pose.translation - run.prior.centre.translation).max())
-    turned_deg = np.rad2deg(np.linalg.norm(log(run.prior.centre.rotation.T @ pose.rotation)))
-    return (
-        f"the first frame's pose is outside the prior of run.yaml: a coordinate is {away_m:.3g} m from position_m"
-        f" (within_m: {run.prior.within_m:g}), the attitude {turned_deg:.3g} deg from that of the prior (within_deg:"
-        f" {np.rad2deg(run.prior.within_rad):g}); correct the prior"
-    )
 
 
 def _prior_numbers(run: Run) -> dict[str, Any] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from geometry.arrays import evenly_spaced
 from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
+from geometry.rotations import log
 from lab.files.run.run_file import Run, VideoFile
 from lab.findings.finding import Finding, Level, finding, sentence, verdict
 from lab.number_format import format_number
@@ -38,6 +39,7 @@ MOST_KEPT = 90  # frames from which they are chosen
 FEWEST, PART = 10, 0.6  # points, and the share of width and height that they do not exceed in part of a picture
 SAME_RATE = 0.02  # relative difference of frame rates, above which they are not the same
 LEAST_SHOWN = 10  # numbers of the rig that a recording must show: four spots at rest agree with many rigs
+_WIDEN = "Correct position_m and yaw_pitch_roll_deg of the prior, or make within_m and within_deg larger."
 DOUBTFUL = 2  # pictures of a camera without any of its spots, from which on a run that passes is tested, too
 
 
@@ -175,6 +177,10 @@ def mistakes_of_run(
     poses hardly use a camera, and for mistakes that its symmetry hides. explained: as in `recorded_mistakes`.
     """
     of_files = (*mistakes_by_themselves(run.rig, run.prior), *rates_of_videos(run))
+    if away := away_from_prior(run, statistics):
+        of_files = (*of_files, *away)
+        if passes:  # the poses do not rest on the prior: other mistakes are tested without it
+            run = replace(run, prior=None)
     cameras, unused = statistics.cameras, unused_cameras(statistics)
     if verdict(of_files) is Level.FAIL:
         return of_files
@@ -190,6 +196,22 @@ def mistakes_of_run(
         return (*others, *of_files)
     unlabelled = [unused_finding(n, cameras[n].points, cameras[n].pictures) for n in unused]
     return (*unlabelled, *others, *of_files)
+
+
+def away_from_prior(run: Run, statistics: RunStatistics) -> tuple[Finding, ...]:
+    """The finding on a first frame whose measured pose is outside the prior that run.yaml states."""
+    pose = statistics.first_pose
+    at_start = statistics.first_measured == statistics.first_frame
+    if run.prior is None or pose is None or not at_start or run.prior.contains(pose):
+        return ()
+    away_m = float(np.abs(pose.translation - run.prior.centre.translation).max())
+    turned_deg = np.rad2deg(np.linalg.norm(log(run.prior.centre.rotation.T @ pose.rotation)))
+    what = (
+        f"the first frame's pose is outside the prior of run.yaml: a coordinate is {away_m:.3g} m from position_m"
+        f" (within_m: {run.prior.within_m:g}), the attitude {turned_deg:.3g} deg from that of the prior (within_deg:"
+        f" {np.rad2deg(run.prior.within_rad):g})"
+    )
+    return (finding("BP-M08", Level.WARN, what, why="one of them is wrong", remedy=_WIDEN),)
 
 
 def unused_cameras(statistics: RunStatistics) -> list[str]:

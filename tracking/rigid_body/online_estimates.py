@@ -233,10 +233,8 @@ class ClutterNearSpots:
     def __init__(self, model: SpotModel, min_per_px2: float) -> None:
         self._camera_of = model.camera_of
         cameras = len(model.camera_names)
-        self._area = np.array(
-            [np.prod(model.image_size_px[model.camera_of == c][0]) if np.any(model.camera_of == c) else np.inf
-             for c in range(cameras)]
-        )  # fmt: skip
+        self._area = np.ones(cameras)  # px^2; not used for a camera that observes no spot
+        self._area[model.camera_of] = np.prod(model.image_size_px, axis=-1)
         self._min = min_per_px2
         self._near = np.full(cameras, START_PER_PX2)
 

@@ -284,6 +284,8 @@ class SourceBlock(fields.Block):
 
 
 def _seconds_or_estimate(value: Any) -> float | str:
+    if isinstance(value, str) and value != ESTIMATE:
+        raise fields.unexpected_value(f"a finite number or `{ESTIMATE}`", value)
     return ESTIMATE if value == ESTIMATE else fields.finite_number(value)
 
 

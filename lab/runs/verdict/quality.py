@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 from lab.findings.finding import Finding, Level, Verdict, finding, level_above, sentence, verdict, worst_first
 from lab.number_format import format_count, format_with_sigma
-from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
+from lab.runs.verdict.run_statistics import (
+    LEAST_DISPLACED,
+    MISSED,
+    CameraStatistics,
+    FrameCause,
+    FrameRanges,
+    RunStatistics,
+)
 from tracking.detection.detect import limit_that_admits
 from tracking.noise_estimation.averaging import LEAST_KEPT, OPEN_SHUTTER
 from tracking.statuses import SpotStatus
@@ -39,7 +46,6 @@ MOSTLY_EMPTY = 0.5  # share of a camera's pictures without any point of light, a
 FEW_SHOWN = 0.1  # share of the frames with enough points, below which too few points are the reason, not the prior
 LONG_EMPTY = 0.05  # share of the run of an empty end of a camera's recording, above which it is reported
 MOST_WRONG = 0.005  # share of the measured poses beyond 10 sigmas from the truth, up to which the run does not fail
-LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
 TOO_WIDE = "BP-V21"  # a light that max_sigma_px excludes, and a spot that is never found
 # Sigmas; least growth of the spots by the share of the picture before: 0.2 gives 0.15 to 0.25, 0.5 gives 0.4 to 1.2.
 _SURE_SIGMAS, _OF_GROWTH = 4.0, 0.6
@@ -264,8 +270,8 @@ def _cameras(statistics: RunStatistics) -> list[Finding]:
     for name, camera in statistics.cameras.items():
         numbers = {"camera": name, **camera.as_mapping()}
         out += _pictures(name, camera, statistics)
-        if len(camera.displaced) >= LEAST_DISPLACED:
-            where = f"{format_count(len(camera.displaced), 'frame')} ({camera.displaced.as_text()})"
+        if len(moved := camera.moved) >= LEAST_DISPLACED:
+            where = f"{format_count(len(moved), 'frame')} ({moved.as_text()})"
             what = (
                 f"camera {name}: in {where} none of its spots is where the other cameras put it: the camera or its"
                 " screen has moved during the recording"
@@ -315,7 +321,8 @@ def _pictures(name: str, camera: CameraStatistics, statistics: RunStatistics) ->
         return []
     if not camera.pictures:
         level = Level.FAIL if statistics.measured == 0 else Level.WARN
-        return [finding("BP-V04", level, f"camera {name} has no usable picture at all", numbers=numbers)]
+        what = f"camera {name} has no usable picture at all{_why_missing(camera)}"
+        return [finding("BP-V04", level, what, numbers=numbers)]
     out = {}
     first, last = missing.ranges[0], missing.ranges[-1]
     scattered = len(missing)
@@ -330,8 +337,13 @@ def _pictures(name: str, camera: CameraStatistics, statistics: RunStatistics) ->
             f"stopped before the end: it has no picture from frame {last[0]} on ({format_count(count, 'frame')})"
         )
     if scattered > (1 - GOOD_PICTURES) * statistics.frames:
-        out["BP-V07"] = f"has no usable picture in {scattered} of {statistics.frames} frames"
+        out["BP-V07"] = f"has no usable picture in {scattered} of {statistics.frames} frames{_why_missing(camera)}"
     return [finding(code, Level.WARN, f"camera {name} {what}", numbers=numbers) for code, what in out.items()]
+
+
+def _why_missing(camera: CameraStatistics) -> str:
+    """The most frequent reason for a missing picture, in brackets; empty where none is known."""
+    return "".join(f" ({reason})" for reason, _ in camera.missing_reasons.most_common(1))
 
 
 def _noise_scale(noise_scale: float) -> list[Finding]:

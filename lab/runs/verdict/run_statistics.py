@@ -242,6 +242,8 @@ MOST_EVENTS = 500  # listed one by one; of the others the number is reported
 # Events that may continue in the next frame: listed once, with their last frame.
 LASTING = ("undecided", "changed", CONTRADICTION, "not_a_covariance")
 _USUAL_CLUTTER = 0.95  # quantile, over the measured frames, of the unlabelled points that count as usual clutter
+LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
+_SHOWN = 0.5  # points beyond the usual clutter over expected spots, from which on spots without labels are seen
 _MOST_POINTS = 50  # larger numbers of unlabelled points are counted as this number
 
 
@@ -280,6 +282,23 @@ class CameraStatistics:
     missing_reasons: Counter[str] = field(default_factory=Counter)
     # Measured frames in which this camera's spots have labels and none of them fits the pose of the other cameras.
     displaced: FrameRanges = field(default_factory=FrameRanges)
+    # Measured frames in which none of two or more expected spots has a label.
+    without_labels: FrameRanges = field(default_factory=FrameRanges)
+    _points_without: Counter[str] = field(default_factory=Counter)  # in those frames: points, expected spots
+    _clutter: Counter[str] = field(default_factory=Counter)  # in frames with labels: points without one, frames
+
+    @property
+    def moved(self) -> FrameRanges:
+        """Frames in which the spots of this camera are seen, and none is where the pose of the others puts it.
+
+        Spots without labels are seen if there are more points than the clutter of frames with labels, by half as many
+        as spots are expected; hidden spots leave the clutter alone.
+        """
+        if len(self.displaced) >= LEAST_DISPLACED or not self._clutter["frames"]:
+            return self.displaced
+        clutter = self._clutter["points"] / self._clutter["frames"] * len(self.without_labels)
+        shown = self._points_without["points"] - clutter > _SHOWN * self._points_without["expected"]
+        return self.without_labels if shown and len(self.without_labels) >= LEAST_DISPLACED else self.displaced
 
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json."""
@@ -291,7 +310,7 @@ class CameraStatistics:
             "spots_found": self.found,
             "empty_at_end": self.empty_at_end,
             "missing": [list(r) for r in self.missing.ranges],
-            "displaced": [list(r) for r in self.displaced.ranges],
+            "displaced": [list(r) for r in self.moved.ranges],
         }
 
 
@@ -414,9 +433,15 @@ class RunStatistics:
                 camera.expected_at_start += expected if camera.points == 0 else 0
                 camera.expected_at_end += expected if camera.empty_at_end else 0
                 labelled = [v for v in views if status[v].measured]
-                measured = record.tracked.pose_status is PoseStatus.MEASURED
-                if labelled and measured and used is not None and not used[labelled].any():
-                    camera.displaced.add(record.frame)
+                if record.tracked.pose_status is not PoseStatus.MEASURED:
+                    continue
+                if labelled:
+                    camera._clutter.update(frames=1, points=len(found) - len(labelled))
+                    if used is not None and not used[labelled].any():
+                        camera.displaced.add(record.frame)
+                elif expected >= 2:
+                    camera.without_labels.add(record.frame)
+                    camera._points_without.update(points=len(found), expected=expected)
 
     def _cause(self, record: FrameRecord) -> FrameCause:
         tracked = record.tracked

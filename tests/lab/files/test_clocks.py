@@ -67,7 +67,7 @@ def test_what_is_to_be_estimated_starts_at_zero_with_the_sigma_of_its_prior(tmp_
         ("row_time_s: 15", "give seconds for one row, not microseconds"),
         ("timestamps: none.csv", "expected a table frame,t_s, found none"),
         ("time_offset_s: 2.1", "expected pictures within the run"),
-        ("time_offset_s: soon", "expected a finite number"),
+        ("time_offset_s: soon", "expected a finite number or `estimate`, got 'soon'"),
     ],
 )
 def test_a_clock_in_other_units_or_without_a_table_is_refused(tmp_path, right, says):

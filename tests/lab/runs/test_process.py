@@ -459,6 +459,10 @@ def test_overrides_replace_parameters_of_the_run_and_of_its_blocks(tmp_path):
         ({"labels.p_detct": 3}, r"--set: labels.*'p_detct'.*did you mean 'p_detect'"),
         ({"lables.p_detect": 3}, r"'lables'.*did you mean 'labels'"),
         ({"r1_px.x": 3}, r"--set: .*r1_px\.x"),
+        ({"p_detect": 1.5}, r"--set: p_detect: expected a number from 0 to 1, got 1.5"),
+        ({"jerk_m_s3": -1}, r"--set: jerk_m_s3: expected a number of 0 or more, got -1"),
+        ({"labels.max_refined": -2}, r"--set: labels: max_refined: expected a number of 1 or more, got -2"),
+        ({"detect.max_detections": 0}, r"--set: detect: max_detections: expected a number of 1 or more, got 0"),
         ({"r1_px": "wide"}, r"--set: r1_px: expected a finite number, got 'wide'"),
         ({"method": "magic"}, r"--set: method: expected .*rigid.*spots.*'magic'"),
     ],
@@ -725,3 +729,47 @@ def test_a_batch_of_one_run_gives_the_tables_of_that_run(tmp_path):
     process_batch([folder], tmp_path / "many")
     for name in HEADERS:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "many/run" / name).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def three_cameras(tmp_path_factory) -> Path:
+    """Points of a rig whose third camera sees what the left one sees, with errors of its own."""
+    run_folder = simulate("huo2015", tmp_path_factory.mktemp("three") / "run", seed=3, frames=60, detections_only=True)
+    for name, key in (("rig.yaml", "cameras"), ("run.yaml", "cameras")):
+        content = yaml.safe_load((run_folder / name).read_text("utf-8"))
+        content[key]["third"] = dict(content[key]["left"])
+        (run_folder / name).write_text(yaml.safe_dump(content), "utf-8")
+    points = pd.read_csv(run_folder / "detections.csv")
+    third = points[points.camera == "left"].assign(camera="third")
+    third["u_px"] += np.random.default_rng(3).normal(0, third["sigma_u_px"])
+    pd.concat([points, third]).to_csv(run_folder / "detections.csv", index=False)
+    return run_folder
+
+
+@pytest.mark.parametrize(("seen", "text"), [("shifted", "third: in 30 frames (30 to 59)"), ("hidden", None)])
+def test_a_camera_that_moves_so_far_that_its_spots_lose_their_labels_is_named(three_cameras, tmp_path, seen, text):
+    """A knock during the recording. Where its spots are hidden, only false points remain, and it has not moved."""
+    run_folder = shutil.copytree(three_cameras, tmp_path / "run")
+    points = pd.read_csv(run_folder / "detections.csv")
+    late = (points.camera == "third") & (points.frame >= 30)
+    if seen == "shifted":
+        points.loc[late, "v_px"] += 70.0
+    else:
+        points = points[~late]
+    points.to_csv(run_folder / "detections.csv", index=False)
+    outcome = process_run(run_folder, tmp_path / "out")
+    assert outcome.result.measured == 60
+    moved = [f.what for f in outcome.verdict.findings if f.code == "BP-V19"]
+    assert [w for w in moved if text is None or text not in w] == []
+    assert len(moved) == (text is not None)
+
+
+def test_a_camera_whose_screen_gets_no_spot_is_used_without_a_warning(three_cameras, tmp_path, recwarn):
+    """Its points are false ones; their density divided by no area at all (once `divide by zero` in log_density)."""
+    run_folder = shutil.copytree(three_cameras, tmp_path / "run")
+    content = yaml.safe_load((run_folder / "rig.yaml").read_text("utf-8"))
+    content["screens"]["floor"] = content["screens"]["left"]
+    content["cameras"]["third"] = content["cameras"]["third"] | {"screen": "floor"}
+    (run_folder / "rig.yaml").write_text(yaml.safe_dump(content), "utf-8")
+    assert process_run(run_folder, tmp_path / "out").result.measured == 60
+    assert not recwarn.list

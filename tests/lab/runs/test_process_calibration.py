@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import datetime
-import json
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from lab.errors import CalibrationError
 from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import RigFile, load_rig_file, save_rig
 from lab.files.run.results import read_poses
+from lab.findings.finding import Level
 from lab.runs.batch.batch import process_batch
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
@@ -117,18 +117,22 @@ def test_a_calibrated_run_whose_vehicle_is_never_found_fails_and_has_its_tables(
     assert np.isnan(read_poses(tmp_path / "out").systematic).all()
 
 
-def test_a_prior_that_the_first_pose_contradicts_is_a_note(tmp_path):
-    """The vehicle is found later, among all poses, and the smoothing pass goes back to the first frame."""
-    run_folder = simulate("smooth", tmp_path / "run", seed=5, frames=60, detections_only=True)
-    process_run(run_folder, tmp_path / "right")
-    notes = json.loads((tmp_path / "right" / "summary.json").read_text("utf-8"))["notes"]
-    assert not any("prior" in note for note in notes)
+@pytest.mark.parametrize(
+    ("scenario", "off_m", "within_m", "rank"), [("huo2015", 0.3, 0.05, 0), ("smooth", 1.0, 0.001, 1)]
+)
+def test_a_prior_that_the_first_pose_contradicts_is_a_reason_of_the_verdict(tmp_path, scenario, off_m, within_m, rank):
+    """The vehicle is found later, among all poses, and the smoothing pass goes back to the first frame.
+
+    rank: among the reasons. The prior, or the pose, is wrong: the second scenario's poses contradict the truth.
+    """
+    run_folder = simulate(scenario, tmp_path / "run", seed=5, frames=60, detections_only=True)
+    assert process_run(run_folder, tmp_path / "right").verdict.status == "pass"
     content = yaml.safe_load((run_folder / "run.yaml").read_text("utf-8"))
     at = content["prior"]["position_m"]
-    content["prior"] |= {"position_m": [at[0] + 1.0, at[1], at[2]], "within_m": 0.001}
+    content["prior"] |= {"position_m": [at[0] + off_m, at[1], at[2]], "within_m": within_m}
     (run_folder / "run.yaml").write_text(yaml.safe_dump(content), "utf-8")
-    process_run(run_folder, tmp_path / "wrong")
-    notes = json.loads((tmp_path / "wrong" / "summary.json").read_text("utf-8"))["notes"]
-    (note,) = [note for note in notes if "prior" in note]
-    assert note.startswith("the first frame's pose is outside the prior of run.yaml: a coordinate is ")
-    assert "(within_m: 0.001)" in note
+    reason = process_run(run_folder, tmp_path / "wrong").verdict.findings[rank]
+    assert (reason.code, reason.level) == ("BP-M08", Level.WARN)
+    assert reason.what.startswith("the first frame's pose is outside the prior of run.yaml: a coordinate is ")
+    assert f"(within_m: {within_m})" in reason.what
+    assert "within_m" in reason.remedy

@@ -14,12 +14,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from click.testing import CliRunner
 
 from bench import refine as bench
 from bench.mistakes.mistakes import CASES, read, turned_aside, write
 from bench.mistakes.recordings import calibrated
 from bench.random_scenes.scene import random_scene
 from bench.random_scenes.write_folder import write_run_folder
+from cli import main
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.forward_model import SpotModel
@@ -497,7 +499,12 @@ def test_targets_of_a_scan_are_metres_and_its_unit_is_recognised(unit, noted, si
 
 @pytest.mark.parametrize(
     ("size", "words"),
-    [((48, 64), "turned by 90 deg"), ((32, 24), "0.5 times the resolution"), ((40, 40), "cropped?")],
+    [
+        ((48, 64), "turned by 90 deg"),
+        ((32, 24), "0.5 times the resolution"),
+        ((31, 24), "times the resolution"),  # a half that was rounded
+        ((40, 40), "cropped?"),
+    ],
 )
 def test_the_size_of_a_picture_shows_the_mistake(tmp_path, size, words):
     run = write_run(tmp_path / "run")
@@ -506,6 +513,9 @@ def test_the_size_of_a_picture_shows_the_mistake(tmp_path, size, words):
     text, status = checked(run)
     assert status == 2
     assert words in text
+    processed = CliRunner().invoke(main, ["run", str(run), "--out", str(tmp_path / "out")])
+    assert processed.exit_code == 4
+    assert f"camera left has no usable picture at all (wrong size {size[0]}x{size[1]}," in processed.stdout
 
 
 def test_of_a_vehicle_at_rest_a_false_point_that_fits_a_mistake_by_chance_counts_once():
