@@ -159,6 +159,7 @@ def test_a_gap_in_smooth_motion_does_not_make_the_frames_beside_it_vague(recordi
     assert np.max(sigma[17:25]) < 4 * np.median(sigma)
 
 
+@pytest.mark.slow
 def test_a_swing_that_begins_after_rest_leaves_no_frame_vague(tmp_path):
     """Its first accelerations appear as velocity jumps, far smaller than those that the fastest motion would allow."""
     write_recording(random_recording(3406, frames=60), tmp_path / "run")
@@ -200,7 +201,8 @@ def rounded(r: Recording, frames: float) -> Recording:
     return replace(r, pose_at=pose_at)
 
 
-@pytest.mark.parametrize(("turn", "frames"), further_slow([(1.0, 40), (3.0, 80)]))
+@pytest.mark.slow
+@pytest.mark.parametrize(("turn", "frames"), [(1.0, 40), (3.0, 80)])
 def test_turns_that_take_some_frames_are_not_taken_for_corners(turn, frames, tmp_path):
     own = figures(rounded(random_recording(4000, frames=frames), turn), tmp_path)
     assert np.nanmean(own.nees) < 1.5
@@ -277,7 +279,8 @@ def test_a_turn_in_a_gap_in_which_nothing_is_seen_is_covered(gap, tmp_path):
     assert np.nanmax(own.nees) < 8
 
 
-@pytest.mark.parametrize("seed", further_slow([6012, 6043]))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [6012, 6043])
 def test_a_turn_that_the_spots_allow_to_be_short_is_in_the_sigmas(seed, tmp_path):
     """A turn that lasts for as long as they allow, or a jerk in its place, rounds the corners of a turntable."""
     own = figures(random_recording(seed, frames=60), tmp_path)
