@@ -118,32 +118,11 @@ def works(desk: Path, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 def test_the_commands_are_those_of_the_contract():
-    assert set(main.commands) == {
-        "run",
-        "batch",
-        "detect",
-        "pick",
-        "watch",
-        "record",
-        "simulate",
-        "check",
-        "report",
-        "study",
-        "track",
-        "stereo",
-        "compare",
-        "export",
-        "view",
-        "show",
-        "calibrate",
-        "refine",
-        "plan",
-        "doctor",
-        "explain",
-        "init",
-        "verify",
-        "schema",
-    }
+    words = (
+        "run batch detect pick watch record simulate check report study track stereo compare "
+        "export view show calibrate refine plan doctor explain init verify schema"
+    )
+    assert set(main.commands) == set(words.split())
     steps = {"board", "camera", "pair", "screen", "beams", "rig", "check", "convert", "simulate"}
     assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
 
@@ -193,16 +172,8 @@ def test_help_names_every_exit_status():
 
 def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     out = desk / example("run")[-1]
-    files = (
-        "detections.csv",
-        "spots.csv",
-        "beams.csv",
-        "attitude.csv",
-        "covariance.csv",
-        "summary.json",
-        "report.html",
-    )
-    assert [name for name in files if not (out / name).is_file()] == []
+    tables = [out / f"{name}.csv" for name in ("detections", "spots", "beams", "attitude", "covariance")]
+    assert [path for path in (*tables, out / "report.html") if not path.is_file()] == []
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
@@ -635,17 +606,11 @@ def test_an_error_message_into_a_closed_pipe_ends_quietly_too(arguments, tmp_pat
 
 @pytest.mark.parametrize(
     ("closed", "arguments", "status"),
-    further_slow(
-        [
-            ("2>&-", ("explain", "BP-V99"), 2),
-            ("<&- >&- 2>&-", ("check", str(SAMPLE / "rig.yaml")), 0),
-            ("2>&-", ("explain", "BP-V03"), 0),
-            (">&-", ("explain", "BP-V03"), 0),
-            (">&- 2>&-", ("check", "nowhere"), 2),
-        ],
-        fast=2,
-    ),
-)
+    further_slow([
+        ("2>&-", ("explain", "BP-V99"), 2), ("<&- >&- 2>&-", ("check", str(SAMPLE / "rig.yaml")), 0),
+        ("2>&-", ("explain", "BP-V03"), 0), (">&-", ("explain", "BP-V03"), 0), (">&- 2>&-", ("check", "nowhere"), 2),
+    ], fast=2),
+)  # fmt: skip
 def test_closed_standard_streams_change_no_exit_status(closed, arguments, status, tmp_path):
     program = shlex.join([sys.executable, "-P", "-c", PROGRAM, *arguments])
     done = subprocess.run(["sh", "-c", f"{program} {closed}"], cwd=tmp_path, capture_output=True, check=False)

@@ -282,14 +282,12 @@ def test_two_photographs_in_which_a_small_copy_of_the_board_was_found_are_left_o
 
 @pytest.mark.parametrize(
     ("second", "counts"),
-    further_slow(
-        [
-            ((1010.0, 1010.0, *TRUTH[2:]), (8, 8)),
-            ((1000.0, 1003.0, 600.0, 545.0, -0.1, 0.03, 0.0, 0.0, 0.0), (10, 5)),
-            ((700.0, 700.0, 640.0, 500.0, -0.05, 0.0, 0.0, 0.0, 0.0), (7, 6)),
-        ]
-    ),
-)
+    further_slow([
+        ((1010.0, 1010.0, *TRUTH[2:]), (8, 8)),
+        ((1000.0, 1003.0, 600.0, 545.0, -0.1, 0.03, 0.0, 0.0, 0.0), (10, 5)),
+        ((700.0, 700.0, 640.0, 500.0, -0.05, 0.0, 0.0, 0.0, 0.0), (7, 6)),
+    ]),
+)  # fmt: skip
 def test_photographs_of_two_cameras_are_named_and_give_no_lens(second, counts):
     names = tuple(f"{n:02d}.png" for n in range(sum(counts)))
     with pytest.raises(IntrinsicsError, match="calibrate each set separately") as error:

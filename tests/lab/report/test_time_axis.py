@@ -211,16 +211,8 @@ def test_the_age_of_the_calibration_is_counted_to_the_recording(tmp_path: Path, 
 
 def test_the_methods_text_has_the_runs_own_numbers_and_cites_what_it_used(page):
     text = re.search(r'id="methods">(.*?)</div>', page, flags=re.S).group(1)
-    for words in (
-        "300 frames",
-        "100 Hz",
-        "6 spots of 3 laser beams",
-        "2 cameras",
-        "beampose 0.1.0",
-        "Huo J",
-        "Bierman",
-    ):
-        assert words in text
+    for word in ("300 frames", "100 Hz", "6 spots of 3 laser beams", "2 cameras", "beampose 0.1.0", "Huo J", "Bierman"):
+        assert word in text
     cited = {int(n) for n in re.findall(r"\[(\d+)\]", text)}
     assert cited == set(range(1, text.count("<li>") + 1))
 
