@@ -67,17 +67,3 @@ def try_only(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
         )
 
     return only
-
-
-@pytest.fixture
-def with_page() -> None:
-    """The report is drawn, in a module whose other tests go without (`no_page`)."""
-
-
-@pytest.fixture
-def no_page(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No report: drawing it takes a third of the time of a short run."""
-    if "with_page" not in request.fixturenames:
-        from lab.report.run import page
-
-        monkeypatch.setattr(page, "write_report", lambda folder, *_: (folder / "report.html").write_text(""))

@@ -46,8 +46,6 @@ from tracking.parameters import LabelParameters
 from tracking.setup_mistakes.evidence import MOST_POINTS, MOST_TRIPLES, Comparison, Frames, compare, invisible_mistakes
 from tracking.setup_mistakes.possible import possible_mistakes
 
-pytestmark = pytest.mark.usefixtures("no_page")
-
 FRAMES = 45
 CASE = {case.name: case for case in CASES}
 

@@ -29,8 +29,6 @@ from lab.simulate.write import simulate
 from tests.marks import further_slow
 from tracking.parameters import LabelParameters
 
-pytestmark = pytest.mark.usefixtures("no_page")
-
 MIRROR_SIGMAS = bench.Sigmas((3e-3, 1.7e-3), (2e-3, 1e-3), (1e-3, 1e-3), clocks=0.0)
 SIGMAS = bench.Sigmas((3e-3, 2e-3), (2e-3, 1e-3), (1e-3, 1e-3), clocks=0.0)
 EXCHANGED = "the pictures of cameras `left` and `right` are exchanged, or they have each other's place"
