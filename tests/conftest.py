@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
+from collections.abc import Callable
 
 # Tests start the program hundreds of times: where the caller forbids byte code, each start compiles the sources again.
 sys.dont_write_bytecode = False
@@ -49,3 +51,19 @@ def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     from lab.runs import process
 
     monkeypatch.setattr(process, "mistakes_of_run", lambda *_, **__: ())
+
+
+@pytest.fixture
+def try_only(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Tries only the possible mistakes of a set-up whose `kind: what` matches: the search among all takes seconds."""
+    from tracking.setup_mistakes import evidence
+
+    every = evidence.possible_mistakes
+
+    def only(words: str) -> None:
+        tried = re.compile(words)
+        monkeypatch.setattr(
+            evidence, "possible_mistakes", lambda *a: [m for m in every(*a) if tried.search(f"{m.kind}: {m.what}")]
+        )
+
+    return only

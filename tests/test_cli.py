@@ -32,6 +32,7 @@ from lab.runs.batch import task as batch
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
+from tests.marks import further_slow
 from tests.paths import ROOT
 
 SAMPLE = ROOT / "sample_runs" / "huo2015"
@@ -117,32 +118,11 @@ def works(desk: Path, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 def test_the_commands_are_those_of_the_contract():
-    assert set(main.commands) == {
-        "run",
-        "batch",
-        "detect",
-        "pick",
-        "watch",
-        "record",
-        "simulate",
-        "check",
-        "report",
-        "study",
-        "track",
-        "stereo",
-        "compare",
-        "export",
-        "view",
-        "show",
-        "calibrate",
-        "refine",
-        "plan",
-        "doctor",
-        "explain",
-        "init",
-        "verify",
-        "schema",
-    }
+    words = (
+        "run batch detect pick watch record simulate check report study track stereo compare "
+        "export view show calibrate refine plan doctor explain init verify schema"
+    )
+    assert set(main.commands) == set(words.split())
     steps = {"board", "camera", "pair", "screen", "beams", "rig", "check", "convert", "simulate"}
     assert {name for name in COMMANDS if name.startswith("calibrate ")} == {f"calibrate {step}" for step in steps}
 
@@ -192,16 +172,8 @@ def test_help_names_every_exit_status():
 
 def test_the_example_of_run_leaves_the_files_of_the_contract(desk):
     out = desk / example("run")[-1]
-    files = (
-        "detections.csv",
-        "spots.csv",
-        "beams.csv",
-        "attitude.csv",
-        "covariance.csv",
-        "summary.json",
-        "report.html",
-    )
-    assert [name for name in files if not (out / name).is_file()] == []
+    tables = [out / f"{name}.csv" for name in ("detections", "spots", "beams", "attitude", "covariance")]
+    assert [path for path in (*tables, out / "report.html") if not path.is_file()] == []
     assert isinstance(json.loads((out / "summary.json").read_text()), dict)
 
 
@@ -250,6 +222,7 @@ def test_the_example_works_without_preparation(works, name):
     assert works(*arguments).strip()
 
 
+@pytest.mark.slow
 def test_the_example_of_batch_has_a_row_for_every_run_and_an_index(desk, works):
     arguments = example("batch")
     works(*arguments)
@@ -438,7 +411,7 @@ def hears_signals() -> None:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
-@pytest.mark.parametrize("sent", ["SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("sent", further_slow(["SIGTERM", "SIGHUP"]))
 def test_a_run_that_is_stopped_by_a_signal_leaves_nothing_and_says_so(tmp_path, sent):
     simulate("smooth", tmp_path / "run", seed=5, frames=400, detections_only=True)
     command = [sys.executable, "-P", "-c", PROGRAM, "run", "run", "--out", "out"]
@@ -483,7 +456,7 @@ def test_an_error_message_that_cannot_be_written_keeps_its_exit_status(tmp_path)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
-@pytest.mark.parametrize("name", ["frames/000001.png", "film.mp4"])
+@pytest.mark.parametrize("name", further_slow(["frames/000001.png", "film.mp4"]))
 def test_a_named_pipe_is_no_picture_and_nothing_waits_for_it(tmp_path, name):
     path = tmp_path / name
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -613,7 +586,7 @@ def test_a_foreign_folder_is_not_replaced(tmp_path):
     assert (tmp_path / "thesis/chapter.tex").read_text() == "years"
 
 
-@pytest.mark.parametrize("arguments", [("check", str(SAMPLE / "rig.yaml")), ("--help",), ("explain",)])
+@pytest.mark.parametrize("arguments", further_slow([(("explain",),), (("check", str(SAMPLE)),), (("--help",),)]))
 def test_output_into_a_closed_pipe_ends_quietly_with_the_status_of_a_closed_pipe(arguments, tmp_path):
     command = [sys.executable, "-P", "-c", PROGRAM, *arguments]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:
@@ -622,7 +595,7 @@ def test_output_into_a_closed_pipe_ends_quietly_with_the_status_of_a_closed_pipe
     assert (started.returncode, errors) == (PIPE_CLOSED, b"")
 
 
-@pytest.mark.parametrize("arguments", [("rnu",), ("explain", "BP-V99")])
+@pytest.mark.parametrize("arguments", further_slow([(("rnu",),), (("explain", "BP-V99"),)]))
 def test_an_error_message_into_a_closed_pipe_ends_quietly_too(arguments, tmp_path):
     command = [sys.executable, "-P", "-c", PROGRAM, *arguments]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:
@@ -633,14 +606,11 @@ def test_an_error_message_into_a_closed_pipe_ends_quietly_too(arguments, tmp_pat
 
 @pytest.mark.parametrize(
     ("closed", "arguments", "status"),
-    [
-        ("2>&-", ("explain", "BP-V03"), 0),
-        ("2>&-", ("explain", "BP-V99"), 2),
-        (">&-", ("explain", "BP-V03"), 0),
-        (">&- 2>&-", ("check", "nowhere"), 2),
-        ("<&- >&- 2>&-", ("check", str(SAMPLE / "rig.yaml")), 0),
-    ],
-)
+    further_slow([
+        ("2>&-", ("explain", "BP-V99"), 2), ("<&- >&- 2>&-", ("check", str(SAMPLE / "rig.yaml")), 0),
+        ("2>&-", ("explain", "BP-V03"), 0), (">&-", ("explain", "BP-V03"), 0), (">&- 2>&-", ("check", "nowhere"), 2),
+    ], fast=2),
+)  # fmt: skip
 def test_closed_standard_streams_change_no_exit_status(closed, arguments, status, tmp_path):
     program = shlex.join([sys.executable, "-P", "-c", PROGRAM, *arguments])
     done = subprocess.run(["sh", "-c", f"{program} {closed}"], cwd=tmp_path, capture_output=True, check=False)

@@ -139,12 +139,9 @@ def test_a_stack_gives_the_same_as_each_element_alone():
     vectors[0, 0], vectors[0, 1] = 0, [0, 0, np.pi]
     R = rotations.exp(vectors)
     of_matrix = (
-        rotations.log,
-        rotations.angle,
-        rotations.quaternion_from_matrix,
-        rotations.ypr_from_matrix,
+        rotations.log, rotations.angle, rotations.quaternion_from_matrix, rotations.ypr_from_matrix,
         rotations.ypr_jacobian,
-    )
+    )  # fmt: skip
     for i, j in np.ndindex(2, 5):
         np.testing.assert_allclose(R[i, j], rotations.exp(vectors[i, j]), atol=ROUNDING)
         np.testing.assert_allclose(

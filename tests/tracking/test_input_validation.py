@@ -16,6 +16,7 @@ from geometry.arrays import Array, Ints
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from lab.simulate.points import CLUTTER, PointRun, simulate_points
+from tests.marks import further_slow
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.detections import UNMATCHED, Detections
 from tracking.input_validation import DUPLICATE_PX, usable_rows
@@ -206,7 +207,7 @@ def test_brighter_spots_are_found_among_four_hundred_false_points():
     assert np.nanmax(outcome.nees) < NEES
 
 
-@pytest.mark.parametrize("bright", [False, None], ids=["dim spots", "no brightness"])
+@pytest.mark.parametrize("bright", further_slow([False, None]), ids=["dim spots", "no brightness"])
 def test_a_start_with_too_many_false_points_gives_no_pose(bright):
     """Without the limit, four of the sixty brightest false points fitted a pose by chance in one of 40 frames."""
     run = recording()

@@ -89,7 +89,7 @@ class PageServer:
             self.token = secrets.token_urlsafe(16)
 
     def __enter__(self) -> PageServer:
-        threading.Thread(target=self._server.serve_forever, name="page", daemon=True).start()
+        threading.Thread(target=self._server.serve_forever, args=(0.05,), name="page", daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:

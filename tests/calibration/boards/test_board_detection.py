@@ -210,7 +210,7 @@ def test_a_charuco_board_near_a_wide_lens_is_found():
     assert np.median(off) < 0.03 * px
 
 
-@pytest.mark.parametrize(("across_px", "seed"), [(5, 1), (8, 3), (12, 0)])
+@pytest.mark.parametrize(("across_px", "seed"), further_slow([(8, 3), (5, 1), (12, 0)]))
 def test_a_blob_between_circles_is_not_taken_for_one_of_them(across_px, seed):
     """At a high threshold several small circles are one blob, whose middle was taken for that of a circle."""
     matrix = np.array([[950.0, 0, 640], [0, 950, 480], [0, 0, 1]])
@@ -465,16 +465,14 @@ def counts(pattern: str, text: str) -> Counter[str]:
 
 @pytest.mark.parametrize(
     ("pattern", "text", "found", "all_"),
-    [
+    further_slow([
         ("chessboard_stereo_opencv/*.jpg", CHESS, 14, 14),
+        ("charuco_aruco_stills/ch*.jpg", "charuco:5x7:40mm:20mm:DICT_6X6_250", 2, 2),
         ("chessboard_webcam_c920/*.jpg", "chessboard:9x7:24.4mm", 7, 7),
         ("chessboard_lowquality_400x300/*.png", CHESS, 13, 13),
-        pytest.param(  # in one the board is seen edge-on
-            *("chessboard_portrait_cams/*/*.jpg", "chessboard:4x7:60mm", 13, 14), marks=pytest.mark.slow
-        ),
-        ("charuco_aruco_stills/ch*.jpg", "charuco:5x7:40mm:20mm:DICT_6X6_250", 2, 2),
-    ],
-)
+        ("chessboard_portrait_cams/*/*.jpg", "chessboard:4x7:60mm", 13, 14),  # in one the board is seen edge-on
+    ], fast=2),
+)  # fmt: skip
 def test_real_boards_are_found(pattern, text, found, all_):
     results = counts(pattern, text)
     assert (results["found"], sum(results.values())) == (found, all_)
@@ -483,16 +481,16 @@ def test_real_boards_are_found(pattern, text, found, all_):
 
 @pytest.mark.parametrize(
     ("pattern", "text", "words"),
-    [
+    further_slow([  # synthetic pictures have the further reasons as well
+        ("charuco_aruco_stills/chor*.jpg", "charuco:7x5:40mm:20mm:DICT_6X6_250", "they fit 5x7 squares"),
+        ("charuco_aruco_stills/gb*.jpg", "chessboard:4x6:40mm", "no chessboard found"),
+        ("circlegrid_robot_wrist/images/[02].png", "circles:9x10:20mm", "the grid continues to the right"),
         ("chessboard_stereo_opencv/left*.jpg", "chessboard:8x6:25mm", "the chessboard continues"),
         ("chessboard_webcam_c920/*4.jpg", "chessboard:9x6:25mm", "9x7 inner corners, not 9x6|beyond 9x6 inner"),
         ("charuco_aruco_stills/chor*.jpg", "charuco:5x7:40mm:20mm:DICT_5X5_100", "of DICT_6X6_50 with numbers up to"),
-        ("charuco_aruco_stills/chor*.jpg", "charuco:7x5:40mm:20mm:DICT_6X6_250", "they fit 5x7 squares"),
         ("charuco_aruco_stills/single*.jpg", "charuco:5x7:40mm:20mm:DICT_6X6_250", "another board"),
-        ("charuco_aruco_stills/gb*.jpg", "chessboard:4x6:40mm", "no chessboard found"),
-        ("circlegrid_robot_wrist/images/[02].png", "circles:9x10:20mm", "the grid continues to the right"),
-    ],
-)
+    ], fast=3),
+)  # fmt: skip
 def test_real_pictures_are_rejected_with_the_right_reason(pattern, text, words):
     results = counts(pattern, text)
     assert all(re.search(words, reason) for reason in results), results

@@ -87,6 +87,9 @@ def test_lens_and_circle_size_are_estimated_within_their_sigmas():
     assert 2 * c.fit.radius_m == pytest.approx(SCENE.board.diameter_m, rel=0.005)
     assert 0 < c.fit.radius_sigma_m < 0.006 * c.fit.radius_m
     assert c.fit.sigma_px < 0.01
+    smaller = replace(c.table.circles, diameter_m=1.6 * c.fit.radius_m)
+    found = {f.what.split(", ")[-1]: f.level for f in findings_of(replace(c, table=replace(c.table, circles=smaller)))}
+    assert found[f"+25.0 % against the {1600 * c.fit.radius_m:.4g} mm stated."] is Level.WARN
 
 
 def test_circles_treated_as_points_would_bias_the_lens_far_beyond_its_sigmas():

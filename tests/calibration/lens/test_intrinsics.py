@@ -16,6 +16,7 @@ from geometry.camera import FISHEYE
 from lab.calibrate.camera.camera_page import findings_of
 from lab.findings.finding import Level, verdict
 from tests.calibration.lens.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
+from tests.marks import further_slow
 
 FIVE = IntrinsicsOptions(lens=LensModel(5))
 QUICK = IntrinsicsOptions(lens=LensModel(4), warp=False)  # the true k3 is too small to be significant
@@ -266,7 +267,7 @@ def of_two_lenses(first: tuple[float, ...], second: tuple[float, ...], counts: t
     return CornerTable.of(mixed, tables[0].board_points, tables[0].middle, SIZE)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", further_slow([2, 1]))
 def test_two_photographs_in_which_a_small_copy_of_the_board_was_found_are_left_out(seed):
     """On a monitor, or pasted: no pose explains them, and the search for outliers hardly converges."""
     table = photographs(Scene(views=14, sigma_px=0.05), seed)
@@ -281,12 +282,12 @@ def test_two_photographs_in_which_a_small_copy_of_the_board_was_found_are_left_o
 
 @pytest.mark.parametrize(
     ("second", "counts"),
-    [
+    further_slow([
         ((1010.0, 1010.0, *TRUTH[2:]), (8, 8)),
         ((1000.0, 1003.0, 600.0, 545.0, -0.1, 0.03, 0.0, 0.0, 0.0), (10, 5)),
         ((700.0, 700.0, 640.0, 500.0, -0.05, 0.0, 0.0, 0.0, 0.0), (7, 6)),
-    ],
-)
+    ]),
+)  # fmt: skip
 def test_photographs_of_two_cameras_are_named_and_give_no_lens(second, counts):
     names = tuple(f"{n:02d}.png" for n in range(sum(counts)))
     with pytest.raises(IntrinsicsError, match="calibrate each set separately") as error:

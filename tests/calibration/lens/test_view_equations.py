@@ -16,6 +16,7 @@ from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom
 from calibration.lens.fit.lens_start import start
 from calibration.lens.fit.view_equations import ViewEquations
 from tests.calibration.lens.lens_scenes import TRUTH, Scene, photographs
+from tests.marks import further_slow
 
 
 @cache
@@ -126,7 +127,7 @@ def drawn_apart(
     return error, at_truth.moved(error)
 
 
-@pytest.mark.parametrize("views", [5, 8, 13, 30])
+@pytest.mark.parametrize("views", further_slow([5, 8, 13, 30], fast=2))
 def test_photographs_that_scatter_have_errors_of_the_stated_size_however_few_they_are(views):
     rng = np.random.default_rng(views)
     squares = []
@@ -137,7 +138,7 @@ def test_photographs_that_scatter_have_errors_of_the_stated_size_however_few_the
     assert np.all((spread > 0.7) & (spread < 1.2)), spread  # without degrees of freedom 1.2 to 1.6
 
 
-@pytest.mark.parametrize("views", [5, 8, 13])
+@pytest.mark.parametrize("views", further_slow([5, 8, 13]))
 def test_photographs_that_scatter_alike_in_every_direction_are_not_held_for_worse(views):
     """Left out in turn, few photographs change the unknowns by more than these err; without that, .6 to .8 sigmas."""
     rng = np.random.default_rng([views, 1])

@@ -151,13 +151,7 @@ def test_pictures_of_one_camera_and_points_of_the_other_can_be_combined(tmp_path
     assert list(got) == [0, 1, 2, 3, 4]
     assert all(isinstance(images["left"], np.ndarray) for images in got.values())
     # nothing found between two rows is a picture without points; beyond the rows there is no picture
-    assert [type(got[f]["right"]) for f in range(5)] == [
-        MissingPicture,
-        Detections,
-        Detections,
-        Detections,
-        MissingPicture,
-    ]
+    assert [type(got[f]["right"]) for f in range(5)] == [MissingPicture, *3 * [Detections], MissingPicture]
     assert [len(got[f]["right"]) for f in (1, 2, 3)] == [1, 0, 2]
     assert any(n.endswith("rows of cameras that the rig does not have are not used: middle") for n in reader.notes)
 

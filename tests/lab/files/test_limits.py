@@ -133,16 +133,9 @@ def test_a_pipe_in_place_of_a_file_that_the_program_wrote_or_lists_is_refused_to
 def test_files_of_users_are_read_through_the_helpers_that_refuse_pipes():
     """Reading a pipe waits for ever. The others read what the program itself holds, or have asked for a file before."""
     asked = {
-        "findings/finding.py",
-        "results/certificate.py",
-        "results/compare.py",
-        "results/export.py",
-        "runs/detect/detect.py",
-        "setup/doctor.py",
-        "files/project/point_files.py",
-        "setup/init.py",
-        "runs/batch/task.py",
-    }
+        "findings/finding.py", "results/certificate.py", "results/compare.py", "results/export.py", "setup/doctor.py",
+        "runs/detect/detect.py", "files/project/point_files.py", "setup/init.py", "runs/batch/task.py",
+    }  # fmt: skip
     found = {
         path.relative_to(ROOT / "lab").as_posix()
         for path in (ROOT / "lab").rglob("*.py")

@@ -40,7 +40,7 @@ def covariance(rig, sigma=2e-4):
     }
 
 
-def test_the_calibrations_covariance_is_in_its_own_table_and_in_the_total(run_folder, tmp_path):
+def test_the_calibrations_covariance_is_in_its_own_table_and_in_the_total(run_folder, tmp_path, with_page):
     process_run(run_folder, tmp_path / "without")
     assert not (tmp_path / "without" / "systematic.csv").exists()
     rig = load_rig_file(run_folder / "rig.yaml").rig

@@ -16,6 +16,7 @@ from lab.files.rig.rig_file import load_rig
 from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.setup.init import Layout, rig_of, start
+from tests.marks import further_slow
 
 LAYOUTS = [
     Layout(),
@@ -28,13 +29,12 @@ LAYOUTS = [
 ]
 
 
-MANY_BEAMS = [
-    pytest.param(Layout(cameras=3, screens=3, beams=12), marks=pytest.mark.slow),
-    pytest.param(Layout(cameras=4, screens=2, beams=5), marks=pytest.mark.slow),
-]
+MANY_BEAMS = [Layout(cameras=3, screens=3, beams=12), Layout(cameras=4, screens=2, beams=5)]
 
 
-@pytest.mark.parametrize("layout", [*(layout for layout in LAYOUTS if layout.beams != 5), *MANY_BEAMS], ids=str)
+@pytest.mark.parametrize(
+    "layout", further_slow([*(layout for layout in LAYOUTS if layout.beams != 5), *MANY_BEAMS], fast=2), ids=str
+)
 def test_the_files_pass_the_check_without_a_remark(tmp_path, layout):
     started = start(tmp_path / "lab", layout, 50.0)
     for path in (started.result, *([started.result / "rig.yaml"] if layout == Layout() else [])):

@@ -73,14 +73,14 @@ def over_edges(pictures: int, length_px: float) -> Array:
     return np.array([[80.0, 60.0], [180.0, 121.0], [300.0, 201.0], [199.0, 260.0]]) + along[:, None]
 
 
-@pytest.mark.parametrize("length_px", [12.0, 25.0])
+@pytest.mark.parametrize("length_px", further_slow([12.0, 25.0]))
 def test_a_spot_that_moves_by_a_few_of_its_widths_over_an_edge_is_found_in_each_picture(length_px):
     paths = over_edges(45, length_px)
     gap, _ = errors(found_in_all(board_pictures(paths, 2.0, 0.0, 1)), paths)
     assert gap.max() < 0.5
 
 
-@pytest.mark.parametrize("modulated", [0.0, 0.3, 0.6])
+@pytest.mark.parametrize("modulated", further_slow([0.0, 0.6, 0.3], fast=2))
 def test_the_sigmas_follow_the_edges_whether_or_not_they_modulate_the_spots(modulated):
     paths = over_edges(45, 160.0)
     gap, sigma = errors(found_in_all(board_pictures(paths, 2.0, modulated, 2)), paths)
@@ -92,7 +92,7 @@ def test_the_sigmas_follow_the_edges_whether_or_not_they_modulate_the_spots(modu
     assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
 
 
-@pytest.mark.parametrize("white", [40.0, 70.0])
+@pytest.mark.parametrize("white", further_slow([40.0, 70.0]))
 def test_spots_that_stay_in_front_of_bright_squares_are_measured_in_the_difference(white):
     """The squares resemble wide lights at rest, over which spots pass in all pictures; little else shows the board."""
     board = 4 + (white - 4) * (BOARD - BLACK) / (WHITE - BLACK)
@@ -103,7 +103,7 @@ def test_spots_that_stay_in_front_of_bright_squares_are_measured_in_the_differen
     assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
 
 
-@pytest.mark.parametrize("away_px", [4.0, 5.0])
+@pytest.mark.parametrize("away_px", further_slow([4.0, 5.0]))
 def test_a_narrow_light_beside_an_edge_that_becomes_brighter_and_moves_is_found(away_px):
     """A single picture does not show it beside the edge, and the background contains half of its light."""
     rng, board = np.random.default_rng(3), 33 + 31 * (BOARD - BLACK) / (WHITE - BLACK)
@@ -146,7 +146,7 @@ def test_a_board_that_modulates_spots_by_half_does_not_shift_them(length_px, lar
     assert np.sqrt(np.mean((gap / sigma) ** 2) / 2) < 1.25
 
 
-@pytest.mark.parametrize("apart_px", [9.0, 14.0])
+@pytest.mark.parametrize("apart_px", further_slow([9.0, 14.0]))
 def test_two_spots_that_stay_near_each_other_on_an_edge_are_not_taken_for_one_light(apart_px):
     """Their joint places form one path, over which one wide light could move."""
     slow = over_edges(45, 12.0)
@@ -294,7 +294,7 @@ def test_a_spot_that_only_the_difference_shows_is_found_where_the_pictures_are_s
         assert np.hypot(*(found.uv_px - at[0]).T).min() < 0.3
 
 
-@pytest.mark.parametrize("sigma_px", [3.0, 4.5])
+@pytest.mark.parametrize("sigma_px", further_slow([3.0, 4.5]))
 def test_a_wide_spot_that_single_pictures_show_in_part_is_measured_in_the_difference(sigma_px):
     """It rests on black between edges, then on an edge; its fit in one picture takes a part of its light."""
     first, last = np.array([101.0, 62.0]), np.array([123.0, 57.0])
@@ -335,7 +335,9 @@ def test_a_wide_spot_that_swings_over_a_printed_mark_is_measured_in_front_of_it(
     assert gap.max() < 0.1
 
 
-@pytest.mark.parametrize(("length_px", "peak"), [(0.4, 22.0), (0.4, 40.0), (0.5, 40.0), (0.6, 40.0)])
+@pytest.mark.parametrize(
+    ("length_px", "peak"), further_slow([(0.4, 22.0), (0.4, 40.0), (0.5, 40.0), (0.6, 40.0)], fast=2)
+)
 def test_a_spot_that_creeps_while_others_move_fast_is_not_taken_for_a_lamp(length_px, peak):
     along = np.linspace(-0.5, 0.5, 45)[:, None]
     paths, fast = [200.3, 100.4] + length_px * along * [0.4, 0.9], [200.0, 220.0] + 250.0 * along * [1.0, 0.0]
@@ -383,7 +385,7 @@ def test_pictures_that_a_light_has_left_are_not_taken_for_some_that_show_it(leng
     further_slow([
         ((180.0, 121.0), 12.0), ((300.0, 201.0), 16.0), ((300.0, 201.0), 12.0), ((199.0, 250.0), 12.0),
         ((180.0, 121.0), 16.0), ((199.0, 250.0), 16.0), ((161.0, 140.0), 16.0),
-    ], fast=2),
+    ]),
 )  # fmt: skip
 def test_two_lights_that_move_by_their_width_beside_each_other_are_measured_on_edges(at, apart_px):
     """Each of them is in some of the pixels around the other one."""

@@ -105,7 +105,7 @@ def judged(recording: Recording, background: StaticBackground, frames: range) ->
     return float(np.mean(hits)), false / len(frames), float(np.sqrt(np.mean(square)))
 
 
-@pytest.mark.parametrize("scale", [1, 16, 200])
+@pytest.mark.parametrize("scale", further_slow([1, 16, 200]))
 def test_spots_that_the_texture_hides_are_found(scale):
     recording = Recording.of(path(45, 6, 4.0, 1), 4.5, scale=scale)
     assert is_limited_by_texture(recording.model)
@@ -154,7 +154,7 @@ def test_constant_light_is_constant_though_the_noise_of_a_picture_is_in_the_mean
         assert {None if s is None else s[0] for s in shown} == {1.0}
 
 
-@pytest.mark.parametrize(("peak", "sigma_px"), [(150.0, 1.1), (40.0, 1.6)])
+@pytest.mark.parametrize(("peak", "sigma_px"), further_slow([(150.0, 1.1), (40.0, 1.6)]))
 @pytest.mark.parametrize("grain_px", further_slow([1.5, 0.6, 2.5]))
 def test_lights_at_rest_have_errors_of_their_places_which_their_own_light_hides(peak, sigma_px, grain_px):
     """Texture under a light is in its fit; what is left shows nothing of it."""

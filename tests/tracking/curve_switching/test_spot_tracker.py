@@ -12,6 +12,7 @@ from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from lab.simulate.points import PointRun, simulate_points
 from lab.simulate.scenarios import RIGS, SCENARIOS, Clutter, Occlusion
+from tests.marks import further_slow
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
 from tracking.curve_switching.vehicle import Tracks
@@ -101,8 +102,10 @@ def tracked(scenario: str, seed: int, frames: int) -> Tracked:
 # -- identity and prediction ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("scenario", "identity", "rms_px"), [("smooth", 0.999, 0.30), ("sharp-turns", 0.995, 0.40)])
-@pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("scenario", "identity", "rms_px"), further_slow([("sharp-turns", 0.995, 0.40), ("smooth", 0.999, 0.30)])
+)
+@pytest.mark.parametrize("seed", further_slow([21, 22]))
 def test_identity_and_prediction_error_reach_the_projects_goals(scenario, identity, rms_px, seed):
     """20 % clutter, 0.1 px noise, 250 frames."""
     t = tracked(scenario, seed, 250)

@@ -16,6 +16,7 @@ from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
 from lab.simulate.scenarios import RIGS
 from tests.geometry.scenes import random_pose, random_rig
+from tests.marks import further_slow
 from tests.tracking.labelling.test_first_labels import (
     NOISE_PX,
     Picture,
@@ -58,7 +59,7 @@ def rates(rig: Rig, count: int, seed: int) -> tuple[float, float, float]:
 # -- without a prior --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["unequal-fan", "four-skew-beams"])
+@pytest.mark.parametrize("name", further_slow(["unequal-fan", "four-skew-beams"]))
 def test_labels_are_right_without_a_prior_among_clutter(name):
     """30 poses: two may stay unlabelled (four spots of two beams are a tie), none may be wrong."""
     right, wrong, _ = rates(RIGS[name](), 30, seed=1)

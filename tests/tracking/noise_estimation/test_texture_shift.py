@@ -76,7 +76,7 @@ def test_the_background_predicts_the_errors_of_bright_and_of_faint_spots(sigma_p
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.mean(expected), rel=0.4)
 
 
-@pytest.mark.parametrize("brightness", [3.0, 10.0])
+@pytest.mark.parametrize("brightness", further_slow([3.0, 10.0]))
 @pytest.mark.parametrize(("sigma_px", "grain_px"), further_slow([(1.6, 1.2), (1.6, 6.0), (3.0, 1.5)], fast=2))
 def test_fits_that_give_bright_pixels_less_weight_have_smaller_errors_on_fine_texture(sigma_px, grain_px, brightness):
     """As a share of those of fits with equal weights; coarse texture shifts all of a spot, whatever the weights."""

@@ -13,6 +13,7 @@ from geometry.pose import Pose, look_at
 from geometry.pose_prior import PosePrior
 from geometry.rig import Beam, Rig, Spot
 from lab.simulate.scenarios import RIGS, fan
+from tests.marks import further_slow
 from tests.tracking.rigid_runs import RIGID, assess, recording_of, smoothed_frames, tracked, with_occlusions
 from tracking.detections import Detections
 from tracking.rigid_body.acquisition import Acquisition
@@ -76,24 +77,26 @@ def with_points_at_rest(found: list[Detections | None], rng: np.random.Generator
     return out
 
 
-@pytest.mark.parametrize("spots", [4, 0])
-def test_long_lenses_find_a_vehicle_of_four_spots_among_many_points_at_rest_from_a_wide_prior(spots):
+@pytest.mark.parametrize(  # searches that find nothing take long
+    ("spots", "seed", "frames"),
+    further_slow([(4, 0, 12), (0, 0, 5), (0, 0, 12), (4, 1, 12), (4, 2, 12), (4, 3, 12)], fast=2),
+)
+def test_long_lenses_find_a_vehicle_of_four_spots_among_many_points_at_rest_from_a_wide_prior(spots, seed, frames):
     """Its spots are shown by a thousandth of the prior's poses. Points at rest alone are never a vehicle."""
     rig = two_beams(25000.0, 1.0)
     prior = PosePrior(Pose.identity(), 1.5, np.deg2rad(20.0))
-    for seed in range(4 if spots else 1):  # searches that find nothing take long
-        rng = np.random.default_rng([seed, 2])
-        at = Pose.from_ypr(np.deg2rad([0.4, 0.2, 0.4]) * rng.uniform(-1, 1, 3), 0.02 * rng.uniform(-1, 1, 3))
-        sway = np.deg2rad(0.3) * np.sin(2 * np.pi * 0.4 * np.arange(12) / 75.0)
-        poses = Pose.from_ypr(np.stack([sway, sway, sway], axis=1) + at.ypr, np.tile(at.translation, (12, 1)))
-        run = recording_of(rig, poses, np.arange(12) / 75.0, 0.05, seed)
-        tracker, at_rest = RigidTracker(rig, RIGID, prior), rng.uniform(0, 1000, (40, 2))
-        for k, found in enumerate(run.detections):
-            shown = [None if f is None else f[np.arange(len(f) if spots else 0)] for f in found]
-            frame = tracker.step(1 / 75.0 if k else 0.0, with_points_at_rest(shown, rng, at_rest))
-            assert (frame.pose_status is PoseStatus.MEASURED) == (spots > 0) or k < 3
-            if spots and k >= 3:
-                assert np.linalg.norm(frame.pose.minus(poses[k])[3:]) < np.deg2rad(0.05)
+    rng = np.random.default_rng([seed, 2])
+    at = Pose.from_ypr(np.deg2rad([0.4, 0.2, 0.4]) * rng.uniform(-1, 1, 3), 0.02 * rng.uniform(-1, 1, 3))
+    sway = np.deg2rad(0.3) * np.sin(2 * np.pi * 0.4 * np.arange(12) / 75.0)
+    poses = Pose.from_ypr(np.stack([sway, sway, sway], axis=1) + at.ypr, np.tile(at.translation, (12, 1)))
+    run = recording_of(rig, poses, np.arange(12) / 75.0, 0.05, seed)
+    tracker, at_rest = RigidTracker(rig, RIGID, prior), rng.uniform(0, 1000, (40, 2))
+    for k, found in enumerate(run.detections[:frames]):
+        shown = [None if f is None else f[np.arange(len(f) if spots else 0)] for f in found]
+        frame = tracker.step(1 / 75.0 if k else 0.0, with_points_at_rest(shown, rng, at_rest))
+        assert (frame.pose_status is PoseStatus.MEASURED) == (spots > 0) or k < 3
+        if spots and k >= 3:
+            assert np.linalg.norm(frame.pose.minus(poses[k])[3:]) < np.deg2rad(0.05)
 
 
 def test_a_vehicle_is_found_at_once_after_an_occlusion_wherever_the_prediction_has_drifted():

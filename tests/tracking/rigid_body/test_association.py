@@ -145,9 +145,9 @@ ONE, BOTH = (True, False), (True, True)
 @pytest.mark.parametrize(
     ("cameras", "most", "seeds"),
     [
-        (ONE, 4, range(30)),
+        (ONE, 4, range(5)),
         (BOTH, 3, range(60, 66)),
-        pytest.param(ONE, 4, range(30, 60), marks=pytest.mark.slow),
+        pytest.param(ONE, 4, range(5, 60), marks=pytest.mark.slow),
         pytest.param(BOTH, 3, range(66, 70), marks=pytest.mark.slow),
     ],
 )

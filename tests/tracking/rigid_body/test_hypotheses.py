@@ -64,15 +64,9 @@ def a_frame(uv: Array, seen: Ints) -> FrameDetections:
 
 def observed(frame: FrameDetections) -> Observation:
     return Observation(
-        MODEL.numbers,
-        VIEW_TABLE,
-        DETECTION_MODEL,
-        NO_CALIBRATION_ERRORS,
-        frame,
-        NO_CALIBRATION_ERRORS,
-        NO_CLOCKS,
-        False,
-    )
+        MODEL.numbers, VIEW_TABLE, DETECTION_MODEL, NO_CALIBRATION_ERRORS, frame, NO_CALIBRATION_ERRORS,
+        NO_CLOCKS, False,
+    )  # fmt: skip
 
 
 def rows_in(seen: Ints) -> Ints:

@@ -13,6 +13,7 @@ from geometry.forward_model import SpotModel
 from geometry.pose import Pose
 from lab.simulate.points import PointRun
 from lab.simulate.scenarios import fan
+from tests.marks import further_slow
 from tests.tracking.rigid_runs import RIGID, assess, found_in, prior_of, recording_of, smoothed_frames, tracked
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.association.joint_search import complete
@@ -40,7 +41,7 @@ def rows_of(run: PointRun, k: int) -> Ints:
     return np.concatenate([np.argsort(run.origin[k][c]) + 3 * c for c in (0, 1)])
 
 
-@pytest.mark.parametrize("axes", [(0, 1), (0, 2)], ids=["yaw and pitch", "yaw and roll"])
+@pytest.mark.parametrize("axes", further_slow([((0, 1),), ((0, 2),)]), ids=["yaw and pitch", "yaw and roll"])
 def test_a_fan_of_equal_angles_that_shakes_keeps_its_labels(axes):
     """Measured before: in 5 to 8 of 300 frames labels were one spot off, with probability 1; smoothed, in 2."""
     run = shaking(axes, 300, 1)

@@ -215,7 +215,7 @@ def disc_behind_an_edge(centre, radius, edge, background=150.0):
 
 
 @pytest.mark.parametrize("radius", further_slow([9.0, 5.0]))
-@pytest.mark.parametrize("steps_of_the_edge", [6, 25])
+@pytest.mark.parametrize("steps_of_the_edge", further_slow([6, 25]))
 def test_a_centre_is_uncertain_while_an_edge_hides_a_part_of_the_target(radius, steps_of_the_edge):
     rng, tracker, ratios, sigmas = np.random.default_rng(4), PointTracker(), [], []
     for k in range(90):
@@ -237,7 +237,7 @@ def test_a_centre_is_uncertain_while_an_edge_hides_a_part_of_the_target(radius, 
 
 
 @pytest.mark.parametrize("hidden_frames", further_slow([60, 0]))
-@pytest.mark.parametrize("px_per_frame", [0.8, 4.0])
+@pytest.mark.parametrize("px_per_frame", further_slow([4.0, 0.8]))
 def test_no_frame_of_an_occlusion_is_off_by_more_than_its_sigmas_say(px_per_frame, hidden_frames):
     """Neither the first and the last ones, which hide less than the area shows, nor those of a target found again."""
     rng, radius, found, centres = np.random.default_rng(6), 7.0, [], []

@@ -45,7 +45,7 @@ def both(rate: float, seed: int) -> tuple[PointRun, Assessment, Assessment]:
     return run, assess(run, causal), assess(run, again)
 
 
-@pytest.mark.parametrize("rate", [HARD, SOFT], ids=["hard", "soft"])
+@pytest.mark.parametrize("rate", further_slow([HARD, SOFT]), ids=["hard", "soft"])
 def test_corners_between_frames_keep_all_labels(rate):
     for seed in (1, 2):
         run, causal, smoothed = both(rate, seed)

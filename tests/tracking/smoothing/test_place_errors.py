@@ -50,7 +50,7 @@ def textured(
     return replace(run, detections=tuple(detections))
 
 
-@pytest.mark.parametrize(("scenario", "least", "most"), [("static", 0.1, 3.0), ("huo2015", 0.5, 1.6)])
+@pytest.mark.parametrize(("scenario", "least", "most"), further_slow([("huo2015", 0.5, 1.6), ("static", 0.1, 3.0)]))
 def test_sigmas_stay_right_where_texture_shifts_the_spots(scenario, least, most):
     """Taken for white noise, they would make the sigmas at rest 10 times too small: a NEES of 100."""
     nees, shares = [], []
@@ -131,7 +131,7 @@ def fast(seed: int, noise_px: float) -> PointRun:
 
 
 @pytest.mark.parametrize("moves", further_slow([False, True]), ids=["slow", "fast"])
-@pytest.mark.parametrize(("stated", "least", "most"), [(1.0, 0.85, 1.15), (2.0, 0.2, 0.33)])
+@pytest.mark.parametrize(("stated", "least", "most"), further_slow([(2.0, 0.2, 0.33), (1.0, 0.85, 1.15)]))
 def test_stated_noise_is_reduced_to_what_the_residuals_allow(stated, least, most, moves):
     nees = []
     for seed in range(2):
@@ -160,7 +160,7 @@ def test_spots_that_are_wider_in_other_places_have_no_larger_errors():
     assert 0.5 < np.nanmean(assess(run, frames).nees) / 6 < 1.5
 
 
-@pytest.mark.parametrize("count", [4, pytest.param(5, marks=pytest.mark.slow), 6])
+@pytest.mark.parametrize("count", further_slow([4, 5, 6]))
 def test_a_vehicle_at_rest_does_not_show_that_its_errors_of_places_are_small(count):
     """Few residuals, which agree in all frames, are small by chance."""
     nees = []
@@ -212,7 +212,7 @@ def with_other_rig(run: PointRun, seed: int) -> tuple[Rig, RigCovariance]:
     return perturbed_rig(run.rig, names, drawn), RigCovariance(names, np.diag(sigma**2))
 
 
-@pytest.mark.parametrize("seed", further_slow(range(4), fast=2))
+@pytest.mark.parametrize("seed", further_slow(range(4)))
 def test_calibration_errors_change_neither_the_noise_of_the_poses_nor_the_errors_of_places(seed):
     """Spots of .01 px, .05 px off by a calibration that says so: taken for errors of places, 2.9 times the sigmas."""
     run = simulate_points("small-motion", seed, frames=100, noise_px=0.01, clutter=0.0)

@@ -101,7 +101,7 @@ def test_steps_with_a_velocity_jump_are_left_out():
     assert np.all(with_jump[150] > without_jump[150])
 
 
-@pytest.mark.parametrize(("amplitude", "largest"), further_slow([(0.3, 1.6), (0.6, 1.5), (0.0, 1.4)], fast=2))
+@pytest.mark.parametrize(("amplitude", "largest"), further_slow([(0.3, 1.6), (0.6, 1.5), (0.0, 1.4)]))
 def test_covariances_are_right_where_one_axis_moves_less_than_the_noise(amplitude, largest):
     """amplitude: of a sine in the rotation about x, in sigmas of one frame's own pose."""
     jerk = np.array([20.0, 50.0, 50.0, 1e-4, 100.0, 100.0]) ** 2

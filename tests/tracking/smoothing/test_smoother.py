@@ -61,7 +61,7 @@ CASES: list[tuple[str, tuple[str, int] | None]] = [
 ]
 
 
-@pytest.mark.parametrize(("scenario", "hide"), further_slow(CASES, fast=3))
+@pytest.mark.parametrize(("scenario", "hide"), further_slow(CASES, fast=2))
 def test_the_smoothing_pass_labels_no_fewer_spots_and_none_wrongly(scenario, hide):
     causal, again = judged_both(both_passes(scenario, 7001, 200, hide))
     assert again.missed() <= causal.missed() + 1

@@ -73,11 +73,7 @@ def test_saving_and_loading_changes_no_bit(seed, count, judged, tmp_path_factory
     names = camera.parameter_names
     covariance = np.cov(A)
     camera = CameraFile(
-        camera.name,
-        camera.image_size_px,
-        camera.camera_matrix,
-        camera.distortion,
-        camera.lens,
+        camera.name, camera.image_size_px, camera.camera_matrix, camera.distortion, camera.lens,
         RigCovariance(names, (covariance + covariance.T) / 2),
         CameraCalibration(
             date=datetime.date(2026, 1, 2), verdict="WARN", rms_px=rng.uniform(), sigma_px=rng.uniform(), views=7,

@@ -47,24 +47,17 @@ def test_the_processes_together_use_every_processor_once(monkeypatch):
         assert 1 <= threads_per_process(jobs) <= max(1, threads_per_process(1) // jobs)
 
 
-def test_closing_in_the_middle_ends_the_processes_at_once():
-    before = set(multiprocessing.active_children())
-    begun = time.monotonic()
+def _raise_at_the_first(error: type[BaseException]) -> None:
     with contextlib.closing(performed([0.0, 300.0, 300.0], sleep, 2)) as results:
         assert next(results) == (0.0, 0.0)
-    assert time.monotonic() - begun < 120
-    assert set(multiprocessing.active_children()) <= before
-
-
-def _raise_at_the_first(error: type[BaseException]) -> None:
-    with contextlib.closing(performed([0.0, 300.0], sleep, 2)) as results:
-        for _ in results:
-            raise error
+        raise error
 
 
 @pytest.mark.parametrize("error", further_slow([KeyboardInterrupt, SystemExit]))
-def test_an_interruption_of_the_parent_ends_the_processes(error):
+def test_an_interruption_of_the_parent_in_the_middle_ends_the_processes_at_once(error):
     before = set(multiprocessing.active_children())
+    begun = time.monotonic()
     with pytest.raises(error):
         _raise_at_the_first(error)
+    assert time.monotonic() - begun < 120
     assert set(multiprocessing.active_children()) <= before

@@ -262,7 +262,7 @@ def test_a_video_and_a_video_served_as_a_stream_are_recorded_picture_by_picture(
     if served:
         quiet = type("Quiet", (http.server.SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
         server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(quiet, directory=str(tmp_path)))
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
         source = f"http://127.0.0.1:{server.server_port}/film.avi"
     done = record({"left": str(source)}, tmp_path / "run", RecordOptions(rig=rig, rate_hz=25.0))
     if server is not None:

@@ -83,7 +83,7 @@ def test_a_lens_without_covariance_is_at_best_a_check(recording):
     assert "BP-J06" in (folder / "other" / "report.html").read_text("utf-8")
 
 
-@pytest.mark.parametrize("error", [-0.03, 0.02])
+@pytest.mark.parametrize("error", further_slow([-0.03, 0.02]))
 def test_a_wrong_focal_length_is_named_with_its_correction(recording, error):
     folder, _, _ = recording
     content = yaml.safe_load((folder / "camera.yaml").read_text())

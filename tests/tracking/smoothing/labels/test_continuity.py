@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.arrays import Array
+from tests.marks import further_slow
 from tests.tracking.smoothing.labels.path_recordings import FRAMES, GAP, context, filmed, without
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.labels.continuity import MIN_SINGLE_CHAIN, continued
@@ -46,7 +47,7 @@ def test_other_frames_are_not_changed():
     np.testing.assert_array_equal(out[outside], before[outside])
 
 
-@pytest.mark.parametrize("length", [1, 2, 10, 25])
+@pytest.mark.parametrize("length", further_slow([2, 10, 1, 25], fast=2))
 def test_false_points_are_not_labelled_while_no_spot_is_visible(length):
     uv = paths()
     hidden = slice(GAP.start, GAP.start + length)
