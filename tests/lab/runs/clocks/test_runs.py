@@ -150,8 +150,6 @@ def test_smooth_motion_is_averaged_over_as_many_frames_as_with_one_clock(tmp_pat
     assert np.nanmean(own.nees) > 0.7
 
 
-<<<<<<< HEAD
-@pytest.mark.usefixtures("no_search")
 def test_cameras_whose_own_spots_leave_the_pose_open_do_not_end_the_averaging(tmp_path, monkeypatch):
     """Each instant has three spots of one camera: whether it counted as one of few spots was a matter of rounding."""
     inside = list[float]()
@@ -165,9 +163,6 @@ def test_cameras_whose_own_spots_leave_the_pose_open_do_not_end_the_averaging(tm
     assert min(inside) > 0.7
 
 
-@pytest.mark.usefixtures("no_search")
-=======
->>>>>>> helper-1
 def test_a_gap_in_smooth_motion_does_not_make_the_frames_beside_it_vague(recording, tmp_path):
     """In a gap the velocities may jump unseen; here the frames around it exclude that."""
     shutil.copytree(recording, tmp_path / "run")
