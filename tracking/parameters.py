@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import Literal
 
 _SHARES = frozenset({"p_detect", "p_blend", "p_manoeuvre", "min_label_probability", "min_explained"})  # at most 1
+_OF_ANY_SIZE = frozenset({"eps1", "eps2"})  # g3 of a motion that turns back may be negative
 
 
 class _InRange:
@@ -17,7 +18,7 @@ class _InRange:
         """Raises ValueError: the first number outside its range."""
         for one in fields(self):  # type: ignore[arg-type]  # of the dataclasses below
             value = getattr(self, one.name)
-            if isinstance(value, bool) or not isinstance(value, int | float):
+            if isinstance(value, bool) or not isinstance(value, int | float) or one.name in _OF_ANY_SIZE:
                 continue
             least, most = int(one.type == "int"), 1.0 if one.name in _SHARES else float("inf")
             if not least <= value <= most:
