@@ -162,10 +162,6 @@ class _Pixels:
         usual = np.concatenate([usual, flicker])
         return _Seen(du, dv, along, across, form, light_of, root, slope, behind, information, residual, usual)
 
-    def structure(self, light: JointLight, seen: _Seen) -> Array:
-        """The background (m,) without its plane, DN."""
-        return np.asarray(seen.behind - light.plane[0] - (self.uv - light.origin) @ light.plane[1:])
-
     def normal(self, light: JointLight, seen: _Seen) -> tuple[Array, Array]:
         """Normal matrix and right side of the step, with the background eliminated."""
         n, m = self.values.shape
@@ -237,14 +233,15 @@ class JointFit:
     strength_cov: Array  # (2, 2): of p and q
     level_dn: float  # DN above black, of the ground
     expected: tuple[float, float]  # share of the light that this modulates, before the fit, and its sigma
-    noise_share: float  # of the structure of the ground: that modulates nothing, and may hide all that the rest does
+    noise_share: float  # of the information on the modulation: by errors of the ground, which modulate nothing
 
     @property
     def shown(self) -> tuple[float, float]:
         """The share of the light that the ground modulates, and its variance, by the pictures alone."""
         (share, variance), (before, sigma) = self.modulated_share(self.level_dn), self.expected
         left = max(1 - variance / sigma**2, _LEAST_SHOWN)  # of the information
-        return before + (share - before) / left, variance / left + (MODULATED[0] * self.noise_share) ** 2
+        shown = max(left - self.noise_share, _LEAST_SHOWN)  # by structure
+        return before + (share - before) / left, variance / shown + (MODULATED[0] * self.noise_share / shown) ** 2
 
     def modulated_share(self, level_dn: float) -> tuple[float, float]:
         """The share of the light that the surface's brightness modulates, where that is `level_dn`; its variance."""
@@ -390,8 +387,9 @@ def _checked(pixels: _Pixels, light: JointLight, width_px: float) -> JointFit | 
     # The noise of the background, 1 / n, is in its information as well.
     shared = max(every - (1 + 1 / n) * own, 0.0) * max(chi2, 1.0) + (_LEAST_SIGMA * float(widths.max())) ** 2
     strength_cov = covariance[:2, :2] * max(chi2, 1.0)
-    lit = np.sum(seen.light_of**2, axis=0)
-    structure2 = float(np.sum(lit * pixels.structure(light, seen) ** 2))
-    noise_share = min(float(np.sum(lit / seen.information)) / max(structure2, 1e-300), 1.0)
+    # The errors of the background look like structure that modulates: so much of the information on q is theirs.
+    weighted = seen.light_of * seen.root
+    noise = np.sum(weighted**2, axis=0) - np.sum(seen.slope * seen.root * weighted, axis=0) ** 2 / seen.information
+    noise_share = min(float(np.sum(noise / seen.information)) * float(covariance[1, 1]), 1.0)
     share = float(shared / max(own, 1e-9))
     return JointFit(light, pixels.uv, share, strength_cov, pixels.usual, pixels.modulated, noise_share)

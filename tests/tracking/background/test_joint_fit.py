@@ -199,6 +199,33 @@ def test_lights_on_ground_of_low_light_hardly_show_what_usual_ground_modulates(m
         assert shown is None or abs(shown.share - modulated) < 2.5 * shown.unlike
 
 
+@pytest.mark.parametrize("modulated", [0.0, 0.8])
+def test_lights_on_smooth_structure_are_modulated_by_as_much_as_they_show(modulated):
+    """The errors of the mean look like fine structure that modulates: what is smooth shows nothing."""
+    side, usual_dn = 160, 20.0
+    y, x = np.mgrid[:side, :side].astype(float)
+    off = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        structure = gaussian_filter(rng.standard_normal(x.shape), 8.0)
+        ground = usual_dn + 3.0 * structure / structure.std()
+        mean = (ground + 1.5 / 11**0.5 * rng.standard_normal(x.shape)).astype(np.float32)
+        found, seen = [], []
+        for k in range(12):
+            u, v = np.array([25.0 + 10 * k, 30.0 + 20 * (k % 5)]) + rng.uniform(-1, 1, 2)
+            light = 130.0 * (1 - modulated + modulated * ground / usual_dn)
+            light *= np.exp(-0.5 * ((x - u) ** 2 + (y - v) ** 2) / 3.4**2)
+            noise2 = 2.2 + 0.05 * light
+            seen.append(ground + light + np.sqrt(noise2) * rng.standard_normal(x.shape))
+            spot = Detections.at(np.array([[u, v]]) + 0.1, np.eye(2)[None])
+            found.append(replace(spot, major_px=np.array([3.4]), minor_px=np.array([3.4]), peak=np.array([125.0])))
+        pictures = Exposures(seen, np.ones(np.shape(seen)[:2]), NoiseModel(1.25, 0.05, 0.0), usual_dn, 0.0)
+        fits = passing_lights(pictures, found, mean, np.full(x.shape, 11))
+        shown = BehindLights.of(pictures, found, np.array([[3.0, 3.0, 2.0]]), fits).modulation
+        off += [] if shown is None else [(shown.share - modulated) / shown.unlike]
+    assert np.sqrt(np.mean(np.square(off or [0.0]))) < 2.0
+
+
 @pytest.mark.parametrize("length_px", further_slow([3.0, 1.5]))
 def test_a_light_that_flickers_by_a_percent_is_measured_as_precisely_as_one_that_does_not(length_px):
     """On texture as fine as the light, which the surface modulates in full."""
