@@ -63,6 +63,15 @@ def upper_median(values: NDArray) -> float:
     return float(np.partition(values.ravel(), half)[half]) if values.size else float("nan")
 
 
+def weighted_median(values: Array, weights: Array) -> float:
+    """The least of the values (n,) up to which half of the weights (n,) lie; 0 without weights."""
+    total = float(weights.sum())
+    if total <= 0:
+        return 0.0
+    order = np.argsort(values)
+    return float(values[order[np.searchsorted(np.cumsum(weights[order]), 0.5 * total)]])
+
+
 def skew(v: Array) -> Array:
     """The matrices (..., 3, 3) with skew(v) @ w = v x w, of vectors (..., 3)."""
     out = np.zeros((*v.shape[:-1], 3, 3))

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from geometry.arrays import MEDIAN_TO_SIGMA, Array
+from geometry.arrays import MEDIAN_TO_SIGMA, Array, weighted_median
 
 _STEPS, _TRIES = 30, 8  # limits: steps of the fit, and shorter trials of each
 _CONVERGED = 1e-5  # relative decrease of the cost
@@ -305,20 +305,16 @@ def _before_ground(light: JointLight, uv: Array, seen: _Seen, noise_dn: float) -
     if not beside.any():
         return light  # it has left the pixels
     about = np.column_stack([np.ones(len(uv)), uv - light.origin])
-    plane = np.array([_median(seen.behind, beside), 0.0, 0.0])
+    plane = np.array([weighted_median(seen.behind, beside), 0.0, 0.0])
     for _ in range(_PLANES):
         left = seen.behind - about @ plane
-        usual = max(MEDIAN_TO_SIGMA * _median(np.abs(left), beside), _LEAST_TEXTURE * noise_dn)
+        usual = max(MEDIAN_TO_SIGMA * weighted_median(np.abs(left), beside), _LEAST_TEXTURE * noise_dn)
         weighted = about * (beside / (1 + (left / usual) ** 2))[:, None]
         plane = np.asarray(np.linalg.lstsq(weighted.T @ about, weighted.T @ seen.behind, rcond=None)[0], float)
     left = seen.behind - about @ plane
     other = np.abs(left) > _EDGE * usual
     alike = max(_alike_px(uv, np.where((beside > 0) & ~other, left, np.nan)), _ALIKE)
     return replace(light, plane=plane, texture_dn=alike * np.where(other, _UNKNOWN * np.abs(left), usual))
-
-
-def _median(values: Array, weight: Array) -> float:
-    return float(np.quantile(values, 0.5, weights=weight, method="inverted_cdf"))
 
 
 def _alike_px(uv: Array, structure: Array) -> float:

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from geometry.arrays import Array, Bools
+from geometry.arrays import Array, Bools, weighted_median
 from geometry.pose import Pose
 from tracking.rigid_body.models.motion import ANY_MOMENT, process_noise
 from tracking.rigid_body.online_estimates import jump_variance
@@ -98,7 +98,7 @@ def next_log_density(log_density: Array, out: Interval, usable: Bools, local: bo
         )
         if not local:
             # The median of the windows: velocity jumps that are not known yet raise few of them.
-            step[:] = _weighted_median(step, g)
+            step[:] = weighted_median(step, g)
         change[:, axis] = np.clip(RELAXATION * step, -MAX_STEP, MAX_STEP)
     return np.clip(log_density + change, *LOG_RANGE)
 
@@ -126,14 +126,6 @@ def _window_sums(values: Array, width: int) -> Array:
     """
     once = window_mean(values, width)
     return np.maximum(window_mean(once, width) * width, 0.0)
-
-
-def _weighted_median(values: Array, weights: Array) -> float:
-    total = float(weights.sum())
-    if total <= 0:
-        return 0.0
-    order = np.argsort(values)
-    return float(values[order[np.searchsorted(np.cumsum(weights[order]), 0.5 * total)]])
 
 
 SHOCK_CHI2 = 20.0  # chi-square of 6 degrees (p = 3e-3) above which a step gets a velocity jump
