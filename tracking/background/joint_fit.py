@@ -325,7 +325,7 @@ def _alike_px(uv: Array, structure: Array) -> float:
     grid[rows, columns] = structure - np.nanmean(structure)
     known = np.isfinite(grid)
     grid[~known] = 0.0
-    area, total = 1.0, float(np.mean(grid[known] ** 2))
+    area, total = 1.0, max(float(np.mean(grid[known] ** 2)), 1e-12)  # 0: one pixel, or all alike
     for one, other in (np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]):
         pairs = max(int(np.count_nonzero(known[one] & known[other])), 1)
         r = min(max(float(np.sum(grid[one] * grid[other])) / (pairs * total), 0.0), 0.95)

@@ -304,3 +304,15 @@ def test_a_light_on_an_even_square_is_placed_by_the_square_whatever_stands_besid
         assert fit is not None
         off.append(fit.light.places - at)
     assert np.sqrt(np.mean(np.square(off))) < 0.026
+
+
+def test_a_light_with_a_single_pixel_of_the_ground_beside_it_is_fitted_or_refused():
+    """Near others, or in the mosaic of a colour camera, little of the ground is left."""
+    at = places(0.0, 1)
+    away = np.hypot(*(UV - at[0]).T)
+    some = away < 1.9 * WIDTH
+    some[np.argmin(np.abs(away - 2.6 * WIDTH))] = True
+    values = pictures(at, 50.0 + 0 * X, 0.4).reshape(1, -1)[:, some]
+    variance = np.full(values.shape, NOISE**2)
+    fit = fitted(UV[some], values, variance, at, WIDTH, HEIGHT, (np.full(some.sum(), 50.0), 15 / variance[0]))
+    assert fit is None or np.abs(fit.light.places - at).max() < 0.1
