@@ -11,7 +11,7 @@ from geometry.arrays import evenly_spaced
 from geometry.camera import Camera
 from geometry.pose_prior import PosePrior
 from geometry.rig import Rig
-from geometry.rotations import log
+from geometry.rotations import angle
 from lab.files.run.run_file import Run, VideoFile
 from lab.findings.finding import Finding, Level, finding, sentence, verdict
 from lab.number_format import format_number
@@ -205,7 +205,7 @@ def away_from_prior(run: Run, statistics: RunStatistics) -> tuple[Finding, ...]:
     if run.prior is None or pose is None or not at_start or run.prior.contains(pose):
         return ()
     away_m = float(np.abs(pose.translation - run.prior.centre.translation).max())
-    turned_deg = np.rad2deg(np.linalg.norm(log(run.prior.centre.rotation.T @ pose.rotation)))
+    turned_deg = np.rad2deg(angle(run.prior.centre.rotation.T @ pose.rotation))
     what = (
         f"the first frame's pose is outside the prior of run.yaml: a coordinate is {away_m:.3g} m from position_m"
         f" (within_m: {run.prior.within_m:g}), the attitude {turned_deg:.3g} deg from that of the prior (within_deg:"

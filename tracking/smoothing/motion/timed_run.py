@@ -23,7 +23,6 @@ from tracking.smoothing.motion.process_noise import (
     largest_jumps,
     largest_near,
     next_log_density,
-    weak_frames,
 )
 from tracking.smoothing.motion.run_detections import (
     Between,
@@ -230,13 +229,15 @@ class _TimedEstimator(_Estimator):
                 break
         return out
 
-    def _edges(self, information: Array) -> Bools:
-        """As in one clock's runs, with the information of all pictures that are as near as the slowest camera's."""
+    def _edges(self) -> Bools:
+        return np.asarray(~self.measured | (self._jumps()[0].max(axis=1) > 0))
+
+    def _around(self, information: Array) -> Array:
+        """That of all pictures that are as near as the slowest camera's: one camera's spots may leave the pose open."""
         apart_s = _longest_step(self.run.detections) * self.frame_s
         first, after = (np.searchsorted(self.t_s, self.t_s + some_s) for some_s in (-apart_s, apart_s))
         padded = np.append(information, np.zeros((1, 6, 6)), axis=0)
-        near = np.add.reduceat(padded, np.column_stack([first, after]).ravel())[::2]
-        return np.asarray(~self.measured | (self._jumps()[0].max(axis=1) > 0) | weak_frames(near, self.measured))
+        return np.asarray(np.add.reduceat(padded, np.column_stack([first, after]).ravel())[::2])
 
     def _with_other_clocks(self, turn: Turn) -> Turn:
         """A turn at the moments that it may have with other clocks: those found with the present ones confirm these."""

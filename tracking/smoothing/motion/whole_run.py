@@ -188,13 +188,18 @@ class _Estimator:
         usual = float(np.median(shown)) * len(shown) / (6 * len(share)) if len(shown) else 1.0
         memory = int(np.clip(np.ceil(2 / max(usual, 1e-3 / self.per_frame)), 3, 200 * self.per_frame))
         # In a direction that few spots hardly determine the motion is that of a gap.
-        edge: Bools = np.concatenate([[True], self._edges(info.information), [True]])
+        weak = weak_frames(self._around(info.information), self.measured)
+        edge: Bools = np.concatenate([[True], self._edges() | weak, [True]])
         near: Bools = largest_near(edge, memory)[1:-1]
         return ~near
 
-    def _edges(self, information: Array) -> Bools:
-        """(T,): frames of gaps, velocity jumps, and with much less information (T, 6, 6) than is usual."""
-        return np.asarray(~self.measured | self.jumped | weak_frames(information, self.measured))
+    def _edges(self) -> Bools:
+        """(T,): frames of gaps and velocity jumps."""
+        return ~self.measured | self.jumped
+
+    def _around(self, information: Array) -> Array:
+        """Of the spots' information about the pose at each instant, (T, 6, 6), what counts for that instant."""
+        return information
 
     def log_evidence(self) -> float:
         """Log-likelihood of the spots, nats up to a constant, with the motion integrated out.
