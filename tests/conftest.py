@@ -54,13 +54,24 @@ def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def try_only(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Tries only the possible mistakes of a set-up whose `kind: what` matches: the search among all takes seconds."""
+def fast(request: pytest.FixtureRequest) -> bool:
+    """Whether only the fast tests run; `make test-all` leaves nothing out."""
+    return bool(request.config.option.markexpr == "not slow")
+
+
+@pytest.fixture
+def try_only(monkeypatch: pytest.MonkeyPatch, fast: bool) -> Callable[..., None]:
+    """Tries only the possible mistakes of a set-up whose `kind: what` matches: the search among all takes seconds.
+
+    Among the fast tests, or always.
+    """
     from tracking.setup_mistakes import evidence
 
     every = evidence.possible_mistakes
 
-    def only(words: str) -> None:
+    def only(words: str, always: bool = False) -> None:
+        if not (fast or always):
+            return
         tried = re.compile(words)
         monkeypatch.setattr(
             evidence, "possible_mistakes", lambda *a: [m for m in every(*a) if tried.search(f"{m.kind}: {m.what}")]

@@ -586,7 +586,9 @@ def test_a_foreign_folder_is_not_replaced(tmp_path):
     assert (tmp_path / "thesis/chapter.tex").read_text() == "years"
 
 
-@pytest.mark.parametrize("arguments", further_slow([(("explain",),), (("check", str(SAMPLE)),), (("--help",),)]))
+@pytest.mark.parametrize(
+    "arguments", further_slow([(("explain",),), (("check", str(SAMPLE / "rig.yaml")),), (("--help",),)])
+)
 def test_output_into_a_closed_pipe_ends_quietly_with_the_status_of_a_closed_pipe(arguments, tmp_path):
     command = [sys.executable, "-P", "-c", PROGRAM, *arguments]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:

@@ -13,13 +13,12 @@ def with_page() -> None:
 
 
 @pytest.fixture(autouse=True)
-def undrawn(request: pytest.FixtureRequest) -> None:
+def undrawn(request: pytest.FixtureRequest, fast: bool) -> None:
     """No report of a fast test in these folders: drawing it takes a third of the time of a short run.
 
     `make test-all` draws all.
     """
     folder = request.path.relative_to(Path(__file__).parent).parts[0]
-    fast = request.config.option.markexpr == "not slow"
     if fast and folder in ("runs", "setup_check") and "with_page" not in request.fixturenames:
         from lab.report.run import page
 

@@ -165,12 +165,8 @@ def test_a_correct_set_up_is_fine(recording):
         ("prior in radians", "prior: yaw_pitch_roll_deg and within_deg are in radians"),
     ],
 )
-@pytest.mark.parametrize("among_all", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(
-    recording, tmp_path, try_only, name, words, among_all
-):
-    if not among_all:
-        try_only(re.escape(words))
+def test_a_mistake_that_the_recording_shows_is_a_problem_at_check(recording, tmp_path, try_only, name, words):
+    try_only(re.escape(words))
     text, status = checked(with_mistake(name, recording, tmp_path / "run"))
     assert status == 2
     assert words in text
@@ -283,7 +279,7 @@ def test_poses_that_the_limited_search_misses_in_a_crowd_are_no_evidence_for_a_m
     for k in range(len(scene)):
         pictures.add(k, dict(zip(scene.rig.cameras, scene.found(k), strict=True)))
     frames = frames_of(pictures.blocks, scene.prior, LabelParameters().min_spots)
-    try_only("^numbers")
+    try_only("^numbers", always=True)
     limited = LabelParameters(max_points=MOST_POINTS, max_triples=MOST_TRIPLES)
     assert not compare(scene.known_rig, frames, limited, scene.covariance).given.is_certain
     found = compare(scene.known_rig, frames, LabelParameters(), scene.covariance)
@@ -302,7 +298,7 @@ def test_turned_pictures_are_named_although_spots_are_hidden_or_few(try_only, se
         found = dict(zip(scene.rig.cameras, scene.found(k), strict=True))
         pictures.add(k, found | {camera: replace(found[camera], uv_px=end - found[camera].uv_px)})
     frames = frames_of(pictures.blocks, scene.prior, LabelParameters().min_spots)
-    try_only(f"camera `{camera}`")
+    try_only(f"camera `{camera}`", always=True)
     found = compare(scene.known_rig, frames, LabelParameters(), scene.covariance).found
     assert [m.what for m, _ in found] == [f"the pictures of camera `{camera}` are turned by 180 deg"]
 
@@ -621,7 +617,7 @@ def test_exchanged_spots_of_a_screen_are_said_to_be_invisible_where_no_beams_can
 )
 def test_a_beam_that_has_moved_is_not_one_whose_ends_are_exchanged(try_only, wrong, rows, words):
     """A reversed beam hardly ever meets a screen: such a rig explains all points but this beam's."""
-    try_only("beam")
+    try_only("beam", always=True)
     lab, (scene,), _ = bench.campaign(8308, 60, recordings=1)
     beam, stated = lab.rig.beams["B"], None
     if wrong == "reversed":
