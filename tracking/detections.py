@@ -72,6 +72,8 @@ class Detections:
     # (n,) share of the covariance due to misfits of the Gaussian (speckle, texture, a skewed spot); None: not known
     misfit: Array | None = field(default=None, kw_only=True)
     chi2: Array | None = field(default=None, kw_only=True)  # (n,) of the fit, per degree of freedom; None: not known
+    # (n,) rms of what the Gaussian leaves, over its height; None, or 0: not known
+    unexplained: Array | None = field(default=None, kw_only=True)
     # (n,) 1: the point is in its place in the whole recording, while others move; None: not known
     at_rest: Array | None = field(default=None, kw_only=True)
     clock: PictureClock | None = field(default=None, kw_only=True)  # None: exposed at the frame's instant
@@ -96,10 +98,11 @@ class Detections:
     def __getitem__(self, rows: Ints | Bools | slice) -> Detections:
         """The points of the given rows, in that order."""
         known: list[Array] = [getattr(self, name)[rows] for name in Detections.__slots__[:7]]
-        place, misfit, chi2, at_rest = (
-            None if x is None else x[rows] for x in (self.place_px2, self.misfit, self.chi2, self.at_rest)
-        )
-        return Detections(*known, place_px2=place, misfit=misfit, chi2=chi2, at_rest=at_rest, clock=self.clock)
+        more: dict[str, Array] = {}
+        for name in Detections.__slots__[7:-1]:
+            if (values := getattr(self, name)) is not None:
+                more[name] = values[rows]
+        return Detections(*known, **more, clock=self.clock)
 
     def joined(self, more: Detections, most: int) -> Detections:
         """These and more points of the same picture, brightest first, at most so many; what is unknown becomes 0."""

@@ -105,6 +105,7 @@ def _along_edges(search: _Search, spots: Detections) -> Detections:
     that do not agree on the place show its error.
     """
     places, lights, misfits = [spots.uv_px], [np.full(len(spots), 1e-9)], [np.ones(len(spots))]
+    unexplained = [np.full(len(spots), np.inf)]
     reach = _NEAR * spots.major_px + _NEAR
     boxes = np.column_stack([spots.uv_px, reach])
     for k in range(0, _DIRECTIONS, 2) if len(spots) else ():
@@ -121,6 +122,7 @@ def _along_edges(search: _Search, spots: Detections) -> Detections:
         places.append(found.uv_px[j])
         lights.append(best.max(axis=1))
         misfits.append(np.maximum(chi2[j], _LEAST_CHI2))
+        unexplained.append(np.zeros(len(spots)) if found.unexplained is None else found.unexplained[j])
     uv = np.array(places)
     whole = np.array(lights) >= _WHOLE * np.max(lights, axis=0)
     weight = whole / np.array(misfits) ** _DECIDED
@@ -132,6 +134,7 @@ def _along_edges(search: _Search, spots: Detections) -> Detections:
     return replace(
         spots, uv_px=mean, cov_px2=spots.cov_px2 + place[:, None, None] * np.eye(2),
         misfit=(before * variance + place) / (variance + place), chi2=np.where(whole, misfits, np.inf).min(axis=0),
+        unexplained=np.where(whole, unexplained, np.inf).min(axis=0),
     )  # fmt: skip
 
 

@@ -167,7 +167,7 @@ class SpotFinder:
             np.zeros(MAX_COMPARED),
         )
         self._cells, self._algebra = np.zeros((CELL_ROWS, MOST_CELLS)), np.zeros((ALGEBRA, 9, 10))
-        self._table, self._count, self._out = np.zeros(most, CANDIDATE), 0, np.zeros((most, 12))
+        self._table, self._count, self._out = np.zeros(most, CANDIDATE), 0, np.zeros((most, 13))
 
     def find(
         self,
@@ -229,7 +229,8 @@ class SpotFinder:
         rows = self._out[: write_detections(self._table[: self._count], regions, self._out)]
         columns = rows.T.copy()
         cov = rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-        return Detections(rows[:, :2].copy(), cov, *columns[5:10], misfit=columns[10], chi2=columns[11])
+        fit = dict(zip(("misfit", "chi2", "unexplained"), columns[10:], strict=True))
+        return Detections(rows[:, :2].copy(), cov, *columns[5:10], **fit)
 
 
 def _insignificance(peaks: Peaks, model: NoiseModel) -> Array:

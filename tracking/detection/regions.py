@@ -5,6 +5,8 @@ In a region only what lies in it, or near it, is measured: the cost follows the 
 
 from __future__ import annotations
 
+from math import pi, sqrt
+
 import numpy as np
 
 from geometry.arrays import Array, Ints
@@ -94,8 +96,8 @@ def drop_duplicates(table: Candidates) -> None:
 def write_detections(table: Candidates, regions: Array, out: Array) -> int:
     """Write the spots that lie in a region (n, 3) into `out`, largest flux first; returns their number.
 
-    Columns of out (most, 12): u, v; cov uu, uv, vv; flux, peak, major, minor, angle; share of the covariance by misfit;
-    chi-square.
+    Columns of out (most, 13): u, v; cov uu, uv, vv; flux, peak, major, minor, angle; share of the covariance by misfit;
+    chi-square; rms of the residuals over the height of the Gaussian.
     """
     for k in range(table.shape[0]):
         found = table[k]["accepted"] and in_a_region(regions, table[k]["u"], table[k]["v"], 0.0)
@@ -109,6 +111,8 @@ def write_detections(table: Candidates, regions: Array, out: Array) -> int:
         row[4], row[5], row[6] = spot["var_v"], spot["flux"], spot["peak"]
         row[7], row[8], row[9] = ellipse.axes(spot["uu"], spot["uv"], spot["vv"])
         row[10], row[11] = spot["misfit"], spot["chi2"]
+        # The gain is the sum of the squared light over that of a pixel's noise, which the height follows from.
+        row[12] = sqrt(spot["chi2"] * pi * row[7] * row[8] / max(spot["gain"], 1e-9))
         count += 1
         i = brightest(table)
     return count

@@ -185,7 +185,7 @@ def _score(problem: LabelProblem, candidate: Candidate, work: PoseWorkspace) -> 
             return -np.inf
         labels[v] = p
         det = add_information(H, J[v], points.cov[p], spots.model_cov[v])
-        score += found - points.log_density[spots.camera[v]] - 0.5 * np.log(det)
+        score += found + points.log_shape[p] - points.log_density[spots.camera[v]] - 0.5 * np.log(det)
         gain[v] = np.inf
     log_det = cholesky(H)
     if log_det == -np.inf:
@@ -241,7 +241,7 @@ def best_point_of(
         d2 = (C * du * du - 2 * B * du * dv + A * dv * dv) / det
         if not free or not d2 < GATE:
             continue
-        value = found - points.log_density[camera] - LOG_2PI - 0.5 * (np.log(det) + d2)
+        value = found + points.log_shape[p] - points.log_density[camera] - LOG_2PI - 0.5 * (np.log(det) + d2)
         if value > best:
             best, best_point = value, p
     return best, best_point

@@ -133,7 +133,7 @@ def _fixed_terms(problem: LabelProblem, labels: Ints, work: PoseWorkspace) -> tu
     for v in range(n):
         if labels[v] != NO_POINT:
             views += 1
-            fixed += found - LOG_2PI
+            fixed += found - LOG_2PI + points.log_shape[labels[v]]
         elif spots.has_image[v] and inside(work.uv[v], spots.size[v]):
             views += 1
             fixed += missed

@@ -15,6 +15,7 @@ from geometry.planes import intersect_surface
 from geometry.rig import Rig
 from tracking.detections import Detections
 from tracking.parameters import LabelParameters
+from tracking.shapes import log_shape_ratio
 
 NO_POINT = -1  # label of a view without a point
 # Sigmas within which points of two cameras that observe the same screen are one point of light.
@@ -30,6 +31,7 @@ class Points(NamedTuple):
     m_per_px: Array  # (m,) m, displacement on the screen for one pixel, the larger of both axes
     first: Ints  # (cameras + 1,) row of the first point of each camera
     row: Ints  # (m,) row in that camera's detections
+    log_shape: Array  # (m,) see `log_shape_ratio`
     log_density: Array  # (cameras,) log of the density of all points, 1/px^2
     log_unused: Array  # (cameras, most + 1): see `_log_unused`
 
@@ -58,7 +60,7 @@ def points_of(
     """
     cameras = len(model.camera_names)
     uv, cov, world, row = [np.zeros((0, 2))], [np.zeros((0, 2, 2))], [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)]
-    m_per_px = [np.zeros(0)]
+    m_per_px, log_shape = [np.zeros(0)], [np.zeros(0)]
     first = np.zeros(cameras + 1, dtype=np.int64)
     log_density = np.zeros(cameras)
     log_unused = np.zeros((cameras, len(model) + 1))
@@ -88,6 +90,9 @@ def points_of(
             world.append(hits[0])
             m_per_px.append(np.linalg.norm(hits[1:] - hits[0], axis=-1).max(axis=0))
             row.append(clearest)
+            ratio = np.zeros(len(found))
+            ratio[order] = log_shape_ratio(found[order], int(np.count_nonzero(model.camera_of == c)))
+            log_shape.append(ratio[clearest])
             count = len(clearest)
             rivals = len(order)
             area = float(np.prod(camera.image_size_px))
@@ -101,6 +106,7 @@ def points_of(
         np.concatenate(m_per_px),
         first,
         np.concatenate(row).astype(np.int64),
+        np.concatenate(log_shape),
         log_density,
         log_unused,
     )

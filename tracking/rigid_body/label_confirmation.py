@@ -37,6 +37,7 @@ from tracking.rigid_body.models.information import well_controlled
 MANY_SPOTS = 6  # with so many, an uncontrolled spot concerns only its own label
 # Of a first acquisition against "all points are false"; false points reach it with exp(-7) = 1e-3 per frame.
 MIN_EVIDENCE_NATS = 7.0
+RESTING_FRAMES = 10  # points at rest have one chance in so many frames, others one in each
 MAX_EVIDENCE, MIN_EVIDENCE = 50.0, -5.0  # nats; a first hypothesis with less evidence is dropped
 MOVED_SIGMAS = 5.0  # of a point, from where it was counted: less is a point at rest, as false points are
 WIDE_SIGMA = 10.0  # m, rad: of a prior that does not matter
@@ -46,21 +47,24 @@ class FirstEvidence:
     """Evidence for a vehicle against "all points are false", until a pose is measured; over frames it adds up.
 
     False points at rest are in the same places in each frame: one frame of them says as much as many. So do the spots
-    of a vehicle at rest. Source: ours.
+    of a vehicle at rest. While most points rest, one that moves is another false point with the label. Source: ours.
     """
 
     def __init__(self, views: int) -> None:
         self.nats = 0.0
+        self._rested = 0  # frames in which the points were where they are
         self._counted = np.full((views, 2), np.nan)  # px, where the points were whose evidence counted last
 
     def add(self, frame: FrameDetections, assigned: Ints, nats: float, continued: bool) -> bool:
         """Add a frame's best assignment (n,); False if the evidence is too small. continued: not found just now."""
         seen = assigned >= 0
         rows = assigned[seen] % BLENDED
-        away2 = np.sum((frame.uv[rows] - self._counted[seen]) ** 2, axis=1)
-        rests = np.all(away2 < MOVED_SIGMAS**2 * np.trace(frame.cov[rows], axis1=1, axis2=2))
-        if not continued or not rests:
-            self._counted[seen] = frame.uv[rows]
+        away2 = np.sum((frame.uv[rows] - self._counted[seen]) ** 2, axis=1)  # nan: not counted yet
+        largest2 = MOVED_SIGMAS**2 * np.trace(frame.cov[rows], axis1=1, axis2=2)
+        rests = bool(np.count_nonzero(away2 < largest2) >= np.count_nonzero(away2 >= largest2))
+        self._rested = self._rested + 1 if continued and rests else 0
+        new = np.isnan(self._counted[:, 0]) if self._rested else seen
+        self._counted[new & seen] = frame.uv[assigned[new & seen] % BLENDED]
         if continued:
             nats = self.nats + (min(nats, 0.0) if rests else nats)
         self.nats = min(nats, MAX_EVIDENCE)
@@ -68,6 +72,11 @@ class FirstEvidence:
             self.nats = 0.0
             return False
         return True
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether false points reach this evidence at most as often as MIN_EVIDENCE_NATS in each frame."""
+        return self.nats + float(np.log1p(min(self._rested, RESTING_FRAMES - 1))) >= MIN_EVIDENCE_NATS
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +92,7 @@ class FrameHypotheses:
     spread: Array  # (6, 6) of the other hypotheses' poses about the best
     searched: Mapping[int, str]  # children that only a search proposed, with the names of their spots
     first: bool  # no pose has been measured yet
-    evidence_nats: float  # of the best hypothesis against "all points are false", until a pose is measured
+    is_vehicle: bool  # enough evidence for the best hypothesis against "all points are false", until a pose is measured
 
     @property
     def best(self) -> int:
@@ -133,7 +142,7 @@ class LabelConfirmation:
         sure = int(distinct_spots((assigned >= 0) & ~doubtful, model.spot_of))
         if sure < MIN_REDUNDANT_SPOTS:
             least = max(least, SURE_PROBABILITY)  # the others do not check a label
-        out = Confirmation(least, not h.first or h.evidence_nats >= MIN_EVIDENCE_NATS, h.spread)
+        out = Confirmation(least, not h.first or h.is_vehicle, h.spread)
         spots = int(distinct_spots(assigned >= 0, model.spot_of))
         if spots and h.before is not None and h.dt_s > 0 and h.parent >= 0:
             out = self._check_by_motion(obs, h, dynamics, out, spots, sure, doubtful)

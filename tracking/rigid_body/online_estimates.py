@@ -16,6 +16,7 @@ from tracking.parameters import TrackerParameters
 from tracking.rigid_body.association.frame_detections import BLENDED, CLUTTER_RADIUS_PX, FrameDetections
 from tracking.rigid_body.frame_summary import FrameSummary
 from tracking.rigid_body.hypotheses.hypothesis_set import Dynamics
+from tracking.shapes import log_shape_ratio
 
 RANGE = (1e-4, 1e5)  # m/s^3 or rad/s^3 per sqrt(Hz)
 _LOG_RANGE = 2 * np.log(RANGE)
@@ -295,11 +296,16 @@ class PointStatistics:
             static[at_rest] = np.maximum(static[at_rest], SURE_LOG_DENSITY)
         elsewhere = np.concatenate([[0], np.cumsum(static == -np.inf)])[first_rows]  # those at no static place
         log_clutter, log_excess = self._clutter.log_density(elsewhere)
+        shape = np.zeros(len(uv))
         if first:
+            # Of a light that is known, its shape is the same in each frame.
+            spots = np.bincount(self._camera, minlength=len(found))
+            shapes = [log_shape_ratio(f, n) for f, n in zip(found, spots.tolist(), strict=True) if f is not None]
+            shape = np.concatenate([np.zeros(0), *shapes])
             # The excess of clutter near spots must not make points without any spot evidence of a vehicle.
             log_clutter, log_excess = log_clutter - log_excess, np.zeros_like(log_excess)
         return FrameDetections(
-            uv, cov, blend, first_rows, has_image, log_clutter, static, major, self._usual_size_px, log_excess
+            uv, cov, blend, first_rows, has_image, log_clutter, static, major, self._usual_size_px, log_excess, shape
         )
 
     def update(self, frame: FrameDetections, assigned: Ints, summary: FrameSummary, measured: bool) -> None:

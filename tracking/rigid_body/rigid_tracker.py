@@ -189,7 +189,7 @@ class RigidTracker:
         self._hypotheses, kept, probability, spread = prune_and_merge(children, count)
         h = FrameHypotheses(
             dt_s, old, self._hypotheses, children, kept, probability, spread, searched, self._last_pose is None,
-            self._evidence.nats,
+            self._evidence.is_enough,
         )  # fmt: skip
         if obs.timed:  # what this frame says about the velocities counts for where its spots have moved
             state = state_of(self._hypotheses, 0)

@@ -52,6 +52,20 @@ def test_flux_and_peak_are_above_the_background():
     assert found.peak[0] == pytest.approx(150.0, abs=12.0)
 
 
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+def test_a_gaussian_leaves_the_noise_unexplained_and_a_square_more(sigma):
+    """As a share of its height; the noise has 1.5 DN in the background and 2.4 DN on top of the light."""
+    found = seen(Scene([Spot(80.3, 60.4, 120.0, sigma, sigma)], SMALL))
+    assert found.unexplained is not None
+    assert 1.2 / 120.0 < found.unexplained[0] < 3.0 / 120.0
+    half = round(1.7 * sigma)
+    image = photograph(Scene([], SMALL), np.random.default_rng(0))
+    image[60 - half : 61 + half, 80 - half : 81 + half] += np.uint8(120)
+    square = find_spots(image, noise=NOISE)
+    assert square.unexplained is not None
+    assert len(square) == 0 or square.unexplained[0] > 0.05
+
+
 @pytest.mark.parametrize("sigma", [0.42, 0.6, 1.0, 3.0, 6.0, 9.0, 13.0])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_spots_from_1_to_30_px_wide_are_found(sigma, seed):

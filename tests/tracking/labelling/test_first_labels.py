@@ -273,6 +273,43 @@ def test_false_points_alone_give_no_pose(name):
         assert find_labels(rig, model, picture.detections, WIDE).chosen is None
 
 
+def with_shapes(picture: Picture, rng: np.random.Generator, clear_objects: float) -> dict[str, Detections]:
+    """The detections with shapes: nine of ten spots are clear, and this share of the false points."""
+    out = {}
+    for name, found in picture.detections.items():
+        clear = rng.random(len(found)) < np.where(picture.origin[name] == FALSE, clear_objects, 0.9)
+        round_px = np.ones(len(found))
+        shape = np.where(clear, 0.01, 0.2)
+        out[name] = replace(found, unexplained=shape, major_px=round_px, minor_px=round_px)
+    return out
+
+
+def test_four_spots_that_anyone_distinguishes_from_objects_are_labelled():
+    """Among 15 other points per picture: by their places alone, about half of such vehicles are found."""
+    rig = RIGS["fan"]()
+    model, rng = SpotModel.of(rig), np.random.default_rng(17)
+    near, right = PosePrior(Pose.identity(), 0.5, np.deg2rad(25)), 0
+    for _ in range(6):
+        pose = pose_within(near, rng)
+        while np.count_nonzero(seen := model.in_picture(model.project(pose)[0])) < 4:
+            pose = pose_within(near, rng)
+        others = tuple(model.views[v][1] for v in np.flatnonzero(seen)[4:])
+        picture = photograph(model, pose, rng, false_points=15, hidden=others)
+        result = find_labels(rig, model, with_shapes(picture, rng, 0.03), near, LabelParameters(max_points=60))
+        right += result.chosen is not None and not wrong_labels(result, model, picture)
+    assert right >= 5
+
+
+@pytest.mark.parametrize("clear_objects", [0.1, 1.0])
+def test_clear_points_alone_give_no_pose(clear_objects):
+    """A lamp among objects, or nothing but lamps: twelve points per picture, five frames."""
+    rig = RIGS["fan"]()
+    model, rng = SpotModel.of(rig), np.random.default_rng(18)
+    for _ in range(5):
+        picture = photograph(model, Pose.identity(), rng, hidden=tuple(rig.spots), false_points=12)
+        assert find_labels(rig, model, with_shapes(picture, rng, clear_objects), WIDE).chosen is None
+
+
 @pytest.mark.slow
 def test_false_points_alone_hardly_ever_give_a_pose():
     """Eight false points per picture, sixty frames."""

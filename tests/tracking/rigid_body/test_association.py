@@ -64,7 +64,7 @@ def frame_of(
     m = len(uv)
     return FrameDetections(
         uv, cov, np.full(m, blend_px), first, np.array(has_image), np.full(N, LOG_CLUTTER),
-        np.full(m, -np.inf), np.full(m, 2.0 * widening), np.full(N, 2.0), np.zeros(N),
+        np.full(m, -np.inf), np.full(m, 2.0 * widening), np.full(N, 2.0), np.zeros(N), np.zeros(m),
     )  # fmt: skip
 
 

@@ -58,7 +58,7 @@ def a_frame(uv: Array, seen: Ints) -> FrameDetections:
     m, clutter = len(rows), np.full(N, np.log(2e-4))
     return FrameDetections(
         uv[rows].reshape(-1, 2), cov, np.zeros(m), first, np.ones(2, dtype=bool), clutter,
-        np.full(m, -np.inf), np.full(m, np.nan), np.full(N, np.nan), np.zeros(N),
+        np.full(m, -np.inf), np.full(m, np.nan), np.full(N, np.nan), np.zeros(N), np.zeros(m),
     )  # fmt: skip
 
 

@@ -39,6 +39,7 @@ class FrameDetections(NamedTuple):
     size_px: Array  # (m,) larger half axis of the detection; nan: not known
     usual_size_px: Array  # (n,) the usual larger half axis of each view's spot; nan: not known
     log_clutter_excess: Array  # (n,) log ratio of the density of false points near a spot to that of the whole picture
+    log_shape: Array  # (m,) log ratio of the probabilities of its shape, for a spot and for a false point
 
 
 class ViewTable(NamedTuple):
@@ -150,7 +151,7 @@ def p_in_picture(u: float, v: float, var_u: float, var_v: float, width: float, h
 @compiled
 def log_false_density(frame: FrameDetections, view: int, d: int) -> float:
     """Log density of false points, 1/px^2, that competes with detection d being a view's spot."""
-    return max(frame.log_clutter[view], frame.log_static[d])
+    return max(frame.log_clutter[view] - frame.log_shape[d], frame.log_static[d])
 
 
 @compiled

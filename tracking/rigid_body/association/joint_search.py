@@ -387,5 +387,6 @@ def explainable(obs: Observation, assigned: Ints) -> float:
                 open_views -= 1
                 det = frame.cov[d, 0, 0] * frame.cov[d, 1, 1] - frame.cov[d, 0, 1] ** 2
                 p = obs.detection_model.p_detect
-                total += max(-np.log(1.0 - p) - log_clutter - 0.5 * np.log(det) - LOG_2PI, 0.0)
+                least = log_clutter - frame.log_shape[d]
+                total += max(-np.log(1.0 - p) - least - 0.5 * np.log(det) - LOG_2PI, 0.0)
     return total

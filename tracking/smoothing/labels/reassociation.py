@@ -186,7 +186,7 @@ def reassociated(
         frame = FrameDetections(
             detections.uv[a:b], detections.cov[a:b], detections.blend_px[a:b], detections.first[k],
             detections.has_image[k], log_clutter[k], run.log_static[a:b], detections.size_px[a:b],
-            detections.usual_size_px, no_excess,
+            detections.usual_size_px, no_excess, np.zeros(b - a),
         )  # fmt: skip
         obs = Observation(
             run.views, run.view_table, run.detection_model, run.calibration_cov, frame, no_shift, no_clocks, False
