@@ -27,6 +27,7 @@ from lab.runs.batch.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.process import process_run
 from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TrackingAndSmoothing
+from lab.runs.verdict.moved_camera import MovedCamera
 from lab.runs.verdict.quality import LEAST_MEASURED
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
 from lab.runs.verdict.score import normalised_squares
@@ -762,6 +763,28 @@ def test_a_camera_that_moves_so_far_that_its_spots_lose_their_labels_is_named(th
     moved = [f.what for f in outcome.verdict.findings if f.code == "BP-V19"]
     assert [w for w in moved if text is None or text not in w] == []
     assert len(moved) == (text is not None)
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 2.0, 25.0])
+def test_poses_after_a_knock_of_one_of_two_cameras_do_not_use_its_pictures(shift_px, tmp_path):
+    """The other camera and the motion give them; they were beyond 10 sigmas, at CHECK or even PASS."""
+    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=90, detections_only=True)
+    points = pd.read_csv(run_folder / "detections.csv")
+    points.loc[(points.camera == "right") & (points.frame >= 45), ["u_px", "v_px"]] += np.array([1.0, -0.6]) * shift_px
+    points.to_csv(run_folder / "detections.csv", index=False)
+    outcome = process_run(run_folder, tmp_path / "out")
+    named = [(f.level.name, f.what) for f in outcome.verdict.findings if f.code == "BP-V19"]
+    if not shift_px:
+        assert outcome.result.moved is None
+        assert named == []
+        return
+    assert outcome.result.moved == MovedCamera(45, "right", left_out=True)
+    assert [
+        level for level, what in named if "before frame 45: its pictures from that frame on are not used" in what
+    ] == ["WARN"]
+    truth = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["errors"]["pose"]["measured"]
+    assert truth["rows"] >= 45
+    assert truth["beyond_10_sigmas"] == 0
 
 
 def test_a_camera_whose_screen_gets_no_spot_is_used_without_a_warning(three_cameras, tmp_path, recwarn):
