@@ -22,9 +22,11 @@ _ASTRAY = 0.2  # share of the expected spots that are shown elsewhere, which is 
 _BEFORE, _AFTER = 0.05, 0.25  # largest share of them before the movement, least share after it
 _FEWEST_ASTRAY = 8.0  # spots
 _USED = 0.1  # share of the expected spots that the poses after the movement still use, from which on they are wrong
+_MERGED_PX = 3.0  # between spots, as TrackerParameters.blend_px
 _OFF = 2.0  # how many times farther than usual, and than those of the other cameras, its points are off the predictions
 _LEAST_OFF_PX = 0.1  # what counts as usual at least
-_NEAR = 10  # frames around the first sign, which a tracker that follows the wrong camera may delay
+_FAR_OFF = 5.0  # the same in other frames than that of the first sign
+_NEAR = 10  # frames around it: a tracker that follows the wrong camera hides it at first
 
 
 @dataclass(slots=True)
@@ -37,15 +39,20 @@ class ShownSpots:
     points: array[float] = field(default_factory=lambda: array("f"))  # detected
     off_px: array[float] = field(default_factory=lambda: array("f"))  # see `off_prediction_px`
 
-    def add(self, frame: int, tracked: TrackedFrame, views: Sequence[int], found: Detections) -> None:
-        """Add the next frame: the camera's views, and the points in its picture."""
-        measured = [v for v in views if tracked.status[v].measured]
+    def add(self, frame: int, tracked: TrackedFrame, views: Sequence[int], found: Detections) -> bool:
+        """Add the next frame: the camera's views, and the points in its picture.
+
+        Returns whether spots have labels and none of them fits the pose. Spots that have merged do not count.
+        """
+        own = sorted(set(views) - merged_spots(tracked, views))
+        measured = [v for v in own if tracked.status[v].measured]
         used = measured if tracked.used_in_pose is None else [v for v in measured if tracked.used_in_pose[v]]
         self.frames.append(frame)
-        self.expected.append(len(measured) + sum(tracked.status[v] is SpotStatus.OCCLUDED for v in views))
+        self.expected.append(len(measured) + sum(tracked.status[v] is SpotStatus.OCCLUDED for v in own))
         self.used.append(len(used))
         self.points.append(len(found))
         self.off_px.append(off_prediction_px(tracked.predicted_px[list(views)], found.uv_px))
+        return bool(measured) and not used
 
     def astray(self) -> Array:
         """(T,): spots that are not found where the pose puts them and are shown elsewhere.
@@ -92,6 +99,16 @@ class ShownSpots:
         return float(np.nan_to_num(now.min()) / max(float(np.median(before)), _LEAST_OFF_PX))
 
 
+def merged_spots(tracked: TrackedFrame, views: Sequence[int]) -> set[int]:
+    """Those of a camera's views whose point is the light of two spots, and those that are not found beside them."""
+    if tracked.used_in_pose is None:
+        return set()
+    points = [v for v in views if tracked.status[v].measured and not tracked.used_in_pose[v]]
+    hidden = [v for v in views if tracked.status[v] is SpotStatus.OCCLUDED]
+    uv = tracked.uv_px
+    return {v for p in points for h in hidden if np.linalg.norm(uv[p] - uv[h]) < _MERGED_PX for v in (p, h)}
+
+
 def off_prediction_px(predicted_px: Array, uv_px: Array) -> float:
     """Median over predicted places (n, 2) of the distance, px, of the nearest of some points (m, 2); nan for none."""
     known = predicted_px[np.isfinite(predicted_px).all(axis=-1)]
@@ -118,9 +135,10 @@ def moved_camera(cameras: Mapping[str, ShownSpots], step: int | None) -> MovedCa
     if not starts and step is None:
         return None
     sign = min([*starts, *([] if step is None else [step])])
-    for frame in (sign, *range(sign - _NEAR, sign + _NEAR)):
+    for frame in sorted(range(sign - _NEAR, sign + _NEAR), key=lambda f: abs(f - sign)):
+        least = _OFF if frame == sign else _FAR_OFF
         off = {name: s.how_far_off(frame) for name, s in cameras.items()}
         *others, most = sorted(off, key=lambda name: off[name])
-        if not others or (off[most] > _OFF and all(off[most] > _OFF * off[other] for other in others)):
+        if not others or (off[most] > least and all(off[most] > least * off[other] for other in others)):
             return MovedCamera(frame, most)
     return MovedCamera(sign, "")

@@ -401,7 +401,7 @@ class RunStatistics:
                 self.tie_text = self.tie_text or event.text
 
     def _add_cameras(self, record: FrameRecord) -> None:
-        status, used = record.tracked.status, record.tracked.used_in_pose
+        status = record.tracked.status
         pictures = zip(self.cameras.items(), record.detections, record.missing, strict=True)
         for (name, camera), found, reason in pictures:
             if found is None:
@@ -418,7 +418,9 @@ class RunStatistics:
             else:
                 camera.empty_at_end += 1
             if record.tracked.pose is not None:
-                camera.spots.add(record.frame, record.tracked, views, found)
+                measured = record.tracked.pose_status is PoseStatus.MEASURED
+                if camera.spots.add(record.frame, record.tracked, views, found) and measured:
+                    camera.displaced.add(record.frame)
                 own = [status[v] for v in views]
                 camera.found += sum(s.measured for s in own)
                 expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
@@ -426,10 +428,6 @@ class RunStatistics:
                 camera.unlabelled += 2 <= expected <= len(found) and not any(s.measured for s in own)
                 camera.expected_at_start += expected if camera.points == 0 else 0
                 camera.expected_at_end += expected if camera.empty_at_end else 0
-                labelled = [v for v in views if status[v].measured]
-                measured = record.tracked.pose_status is PoseStatus.MEASURED
-                if measured and labelled and used is not None and not used[labelled].any():
-                    camera.displaced.add(record.frame)
 
     def _cause(self, record: FrameRecord) -> FrameCause:
         tracked = record.tracked
