@@ -17,9 +17,11 @@ import yaml
 
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.rotations import matrix_from_quaternion
 from lab.errors import InputError, RunError
 from lab.files.run.results import POSE_STATUSES, are_results, read_poses, read_spots
 from lab.files.run.run_file import load_run
+from lab.files.run.truth import read_true_poses
 from lab.files.text import columns
 from lab.files.text.json_text import plain_value
 from lab.runs import process, processed, smoothing_pass
@@ -785,6 +787,37 @@ def test_poses_after_a_knock_of_one_of_two_cameras_do_not_use_its_pictures(shift
     truth = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["errors"]["pose"]["measured"]
     assert truth["rows"] >= 45
     assert truth["beyond_10_sigmas"] == 0
+
+
+def test_the_point_of_two_spots_that_have_merged_does_not_shift_the_poses(tmp_path):
+    """A second laser beside the first one: the table has one point between both, and states the sigma of a spot."""
+    run_folder = simulate("huo2015", tmp_path / "run", seed=6, frames=60, detections_only=True)
+    rig = yaml.safe_load((run_folder / "rig.yaml").read_text("utf-8"))
+    name, beam = next(iter(rig["target"]["beams"].items()))
+    direction = np.array(beam["direction"]) + [0.0, 0.0, 0.0015]
+    rig["target"]["beams"]["beside"] = {**beam, "direction": (direction / np.linalg.norm(direction)).tolist()}
+    spot, of = next((s, of) for s, of in rig["target"]["spots"].items() if of["beam"] == name)
+    rig["target"]["spots"]["beside"] = {**of, "beam": "beside"}
+    (run_folder / "rig.yaml").write_text(yaml.safe_dump(rig), "utf-8")
+    model = SpotModel.of(load_run(run_folder).rig)
+    truth = read_true_poses(run_folder / "truth" / "pose.csv")
+    uv, _ = model.project(Pose(matrix_from_quaternion(truth.quaternion_wxyz), truth.position_m))
+    camera = next(c for c, s in model.views if s == spot)
+    one, two = uv[:, model.views.index((camera, spot))], uv[:, model.views.index((camera, "beside"))]
+    points = pd.read_csv(run_folder / "detections.csv")
+    of_camera = points[points.camera == camera]
+    off = np.linalg.norm(of_camera[["u_px", "v_px"]].to_numpy() - one[of_camera.frame], axis=1)
+    merged = of_camera.index[off < 1.5]
+    frames = points.loc[merged, "frame"]
+    points.loc[merged, ["u_px", "v_px"]] += (two - one)[frames] / 2
+    points.to_csv(run_folder / "detections.csv", index=False)
+    assert len(merged) > 40
+    assert np.median(np.linalg.norm(two - one, axis=1)) == pytest.approx(1.5, abs=1.2)
+    outcome = process_run(run_folder, tmp_path / "out")
+    assert outcome.result.measured > 50
+    measured = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["errors"]["pose"]["measured"]
+    print(measured)
+    assert measured["nees_mean"] < 9  # of 6
 
 
 def test_a_camera_whose_screen_gets_no_spot_is_used_without_a_warning(three_cameras, tmp_path, recwarn):
