@@ -794,7 +794,7 @@ def test_the_point_of_two_spots_that_have_merged_does_not_shift_the_poses(tmp_pa
     run_folder = simulate("huo2015", tmp_path / "run", seed=6, frames=60, detections_only=True)
     rig = yaml.safe_load((run_folder / "rig.yaml").read_text("utf-8"))
     name, beam = next(iter(rig["target"]["beams"].items()))
-    direction = np.array(beam["direction"]) + [0.0, 0.0, 0.0015]
+    direction = np.add(beam["direction"], [0.0, 0.0, 0.0015])
     rig["target"]["beams"]["beside"] = {**beam, "direction": (direction / np.linalg.norm(direction)).tolist()}
     spot, of = next((s, of) for s, of in rig["target"]["spots"].items() if of["beam"] == name)
     rig["target"]["spots"]["beside"] = {**of, "beam": "beside"}
