@@ -1,8 +1,9 @@
 """A camera that was moved during a run: the frame, and which camera.
 
 Two signs show the frame. From it on spots are not found where the poses put them, although the camera shows as many
-points elsewhere; or a camera's attitude has a step in the residuals (`movement_of_a_camera`). The camera is the one whose
-points are off all predictions in that frame, while those of the others are where they were predicted. Source: ours.
+points elsewhere; or a camera's attitude has a step in the residuals (`movement_of_a_camera`). The camera is the one
+whose points are off all predictions in that frame, while those of the others are where they were predicted. Source:
+ours.
 """
 
 from __future__ import annotations
