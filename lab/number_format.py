@@ -31,6 +31,8 @@ def format_with_sigma(value: float, sigma: float, signed: bool = False) -> str:
         return "\u2013"
     if not (np.isfinite(sigma) and sigma > 0):
         return format_number(value, 2, signed)
+    if sigma < 1e-9:  # rounding errors: nothing is measured so well
+        return f"{format_number(value, 2, signed)} ± {format_number(sigma, 1)}"
     power = int(np.floor(np.log10(sigma)))
     decimals = max(0, -power + (1 if sigma / 10.0**power < 2 else 0))
     text = f"{value:{'+' if signed else ''}.{decimals}f} ± {sigma:.{decimals}f}"

@@ -129,12 +129,15 @@ def answers_in_memory(scene: Scene, parameters: TrackerParameters | None = None)
         def on_frame(record: FrameRecord, then: FrameRecord | None) -> None:
             nonlocal seconds
             assert then is not None, "expected the output of both passes, got the causal one"
+            if smoothed and record.frame <= smoothed[-1].frame:  # written again, without a camera that was moved
+                smoothed.clear()
+                causal.clear()
             smoothed.append(record)
             causal.append(then)
             seconds = time.process_time() - start
 
         passes = TrackingAndSmoothing(pipeline, work)
-        _, _, verdict = process.write_tables(pipeline, passes, work, on_frame=on_frame)
+        _, _, verdict = process.write_tables(passes, work, on_frame=on_frame)
     return Answers(
         _pass(scene, smoothed),
         _pass(scene, causal),

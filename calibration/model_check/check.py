@@ -28,6 +28,7 @@ from calibration.model_check.fault_identification import (
     WeightedDiagnosis,
     diagnose_with_noise_of_cameras,
     effect_of,
+    movement_of_a_camera,
     pose_variances,
 )
 from calibration.model_check.faults import FaultParameters, possible_faults
@@ -225,6 +226,7 @@ class ModelCheckResult:
     noise_of_cameras: Mapping[str, float] = field(default_factory=dict)  # ratio of their errors to the stated sigmas
     stated_residual_scale: float = float("nan")  # residual scale before these ratios are applied
     frame_interval_s: float = float("nan")  # median
+    moved_at_s: float | None = None  # time of the first frame after a camera has moved, as the residuals show it
 
 
 def evaluate_model(
@@ -267,6 +269,7 @@ def evaluate_model(
         return ModelCheckResult(*counts, NotTested.NO_REDUNDANCY, statistics, unseen=unseen, usual_views=usual)
     faults = possible_faults(rig, parameters)
     weighted = diagnose_with_noise_of_cameras(parameters, recording, lin, jacobian, faults)
+    moved_at = movement_of_a_camera(weighted, faults)
     if weighted.diagnosis.unexplained:
         usual_frames = _usual_frames(lin)
         few = linearise(model, recording, usual_frames)
@@ -284,6 +287,7 @@ def evaluate_model(
         noise_of_cameras=dict(zip(model.camera_names, weighted.noise_of_cameras, strict=True)),
         stated_residual_scale=weighted.stated_residual_scale,
         frame_interval_s=float(np.median(np.diff(recording.t_s))),
+        moved_at_s=float(recording.t_s[lin.frames[moved_at]]) if moved_at >= 0 else None,
     )
 
 

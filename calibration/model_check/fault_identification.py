@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.changes import Change, ChangeCandidate, ExcessResidual
-from calibration.model_check.faults import PIXEL_OFFSET, VIEW, FaultParameters, PossibleFault
+from calibration.model_check.faults import CAMERA, MOVED, PIXEL_OFFSET, VIEW, FaultParameters, PossibleFault
 from calibration.model_check.linearised_frames import LinearisedFrames, ModelCheckRecording, correlation_time, linearise
 from geometry.arrays import Array
 from geometry.forward_model import SpotModel
@@ -256,6 +256,40 @@ def _noise_of_cameras(diagnosis: FaultDiagnosis, model: SpotModel) -> list[float
     for c in range(len(model.camera_names)):
         known = diagnosis.noise_of_views[(model.camera_of == c) & np.isfinite(diagnosis.noise_of_views)]
         out.append(float(np.median(known)) if len(known) else 1.0)
+    return out
+
+
+_STEP_CHI2 = 60.0  # least difference of a step to constant faults; of 6 parameters and all frames chance makes 25
+_STEP_SHARE = 0.05  # of what the step explains: a constant fault that is not linear is fitted better in a part as well
+_LEAST_NOISE = 0.1  # noise scale: sigmas that are stated too large hide no step
+_STEP_FRAMES = 5  # before the step and after it
+
+
+def movement_of_a_camera(weighted: WeightedDiagnosis, faults: Sequence[PossibleFault]) -> int:
+    """Index among the K frames of the first one after a camera has moved, as the residuals show it; -1: none has.
+
+    A movement from each frame on must explain more of the residuals than constant faults do. Which of two cameras it
+    was these do not show: the poses absorb what both have in common.
+    """
+    lin, diagnosis = weighted.lin, weighted.diagnosis
+    K = len(lin.frames)
+    r = lin.residual_part(lin.residual).reshape(K, -1)
+    variance = max(diagnosis.noise_scale, _LEAST_NOISE) ** 2 * diagnosis.correlation_frames
+    constant = sum(c.best.change.explained for c in diagnosis.suspected_faults)
+    constant *= diagnosis.excess_noise**2 * diagnosis.correlation_frames / variance
+    most, out = 0.0, -1
+    for fault in faults if K > 2 * _STEP_FRAMES else ():
+        if fault.component != CAMERA or fault.kind != MOVED:
+            continue
+        A = lin.residual_part(weighted.jacobian @ fault.directions).reshape(K, r.shape[1], -1)
+        after = np.s_[::-1]  # sums from each frame to the last
+        N = np.cumsum((np.swapaxes(A, 1, 2) @ A)[after], axis=0)[after] / variance + np.diag(fault.prior_sigma**-2)
+        b = np.cumsum(np.einsum("kri,kr->ki", A, r)[after], axis=0)[after] / variance
+        explained = np.einsum("ki,ki->k", b, np.linalg.solve(N, b[..., None])[..., 0])
+        k = _STEP_FRAMES + int(np.argmax(explained[_STEP_FRAMES : K - _STEP_FRAMES]))
+        gain = float(explained[k]) - max(float(explained[0]), constant)
+        if gain > max(_STEP_CHI2, _STEP_SHARE * explained[k], most):
+            most, out = gain, k
     return out
 
 

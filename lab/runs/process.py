@@ -15,7 +15,7 @@ from geometry.forward_model import SpotModel
 from lab.files.rig.camera_file import require_valid_calibration
 from lab.files.run.fingerprints import fingerprints
 from lab.files.run.results import SUMMARY_SCHEMA, ResultFolder, are_results
-from lab.files.run.run_file import Run, load_run
+from lab.files.run.run_file import LiveDevice, Run, load_run
 from lab.files.run.truth import load_run_truth
 from lab.files.text.atomic_write import atomic_folder
 from lab.files.text.dataclass_fields import with_overrides
@@ -31,6 +31,7 @@ from lab.runs.setup_check import SampledFrames, mistakes_of_run
 from lab.runs.smoothing_pass import SmoothingSummary, TrackingAndSmoothing, clock_findings
 from lab.runs.tables import TableWriter
 from lab.runs.verdict import quality
+from lab.runs.verdict.moved_camera import MovedCamera, moved_camera
 from lab.runs.verdict.run_statistics import MOST_EVENTS, CameraStatistics, FrameChecks, RunStatistics
 
 if TYPE_CHECKING:
@@ -215,8 +216,8 @@ def write_results(
     with listening() as log:
         log.start(run, versions())
         passes = TrackingAndSmoothing.of(pipeline, work, log.progress(progress))
+        statistics, model_check, verdict = write_tables(passes, work, causal=causal)
         pipeline = passes.pipeline
-        statistics, model_check, verdict = write_tables(pipeline, passes, work, causal=causal)
         from lab.runs.verdict.score import against_truth, read_tables
 
         tables, added = against_truth(read_tables(ResultFolder(work)), run.folder), more()
@@ -235,7 +236,6 @@ def write_results(
 
 
 def write_tables(
-    pipeline: Pipeline,
     passes: TrackingAndSmoothing,
     work: Path,
     *,
@@ -244,9 +244,32 @@ def write_tables(
 ) -> tuple[RunStatistics, ModelCheck, Verdict]:
     """Track a run, write its tables into `work`, and compute the verdict.
 
-    on_frame: called with each frame as it is written and, unless `causal`, the same frame of the causal pass.
+    Where a camera was moved during a recording, its pictures from then on are left out, and the tables are written
+    again. on_frame: called with each frame as it is written and, unless `causal`, the same frame of the causal pass.
     """
-    run = pipeline.run
+    from lab.runs.model_check.check import check_sampled_frames  # deferred: only needed at the end of a run
+
+    run = passes.pipeline.run
+    statistics, sampler, pictures = _written(passes, work, causal, on_frame)
+    model_check = check_sampled_frames(run.rig, sampler, run.covariance)
+    moved = _movement(run, statistics, model_check)
+    if moved is not None and moved.camera and not any(isinstance(s, LiveDevice) for s in run.cameras.values()):
+        passes.leave_out(moved.camera, moved.frame)
+        statistics, sampler, pictures = _written(passes, work, causal, on_frame)
+        model_check = check_sampled_frames(run.rig, sampler, run.covariance)
+        moved = dataclasses.replace(moved, left_out=True)
+    statistics.moved = moved
+    return statistics, *_judged(passes, statistics, model_check, sampler, pictures)
+
+
+def _written(
+    passes: TrackingAndSmoothing,
+    work: Path,
+    causal: bool,
+    on_frame: Callable[[FrameRecord, FrameRecord | None], None] | None,
+) -> tuple[RunStatistics, FrameSampler, SampledFrames]:
+    """The tables of a run, and what the verdict needs of its frames. Arguments as of `write_tables`."""
+    run = passes.pipeline.run
     model = SpotModel.of(run.rig)
     checks = FrameChecks(run.rig, run.covariance)
     statistics = RunStatistics(
@@ -270,15 +293,34 @@ def write_tables(
                 sampler.add_record(record, model.camera_of, run.tracker)
                 yield record, before
 
-        for record, in_causal_pass in rows_of(pipeline, sampled(checks.passed(records))):
+        for record, in_causal_pass in rows_of(passes.pipeline, sampled(checks.passed(records))):
             tables.write(record, in_causal_pass)
             statistics.add(record, in_causal_pass)
             pictures.add(record.frame, dict(zip(run.rig.cameras, record.detections, strict=True)))
             if on_frame is not None:
                 on_frame(record, in_causal_pass)
-    from lab.runs.model_check.check import check_sampled_frames  # deferred: only needed at the end of a run
+    return statistics, sampler, pictures
 
-    model_check = check_sampled_frames(run.rig, sampler, run.covariance)
+
+def _movement(run: Run, statistics: RunStatistics, model_check: ModelCheck) -> MovedCamera | None:
+    """The movement of a camera during the run that its frames or its model check show."""
+    at_s, step = model_check.result.moved_at_s, None
+    if at_s is not None:
+        frames = np.arange(statistics.first_frame, statistics.last_frame + 1)
+        step = int(frames[np.argmin(np.abs(run.times.t_s(frames) - at_s))])
+    return moved_camera({name: c.spots for name, c in statistics.cameras.items()}, step)
+
+
+def _judged(
+    passes: TrackingAndSmoothing,
+    statistics: RunStatistics,
+    model_check: ModelCheck,
+    sampler: FrameSampler,
+    pictures: SampledFrames,
+) -> tuple[ModelCheck, Verdict]:
+    """The verdict on a run, and its model check with the findings on the clocks."""
+    pipeline, run = passes.pipeline, passes.pipeline.run
+    model = SpotModel.of(run.rig)
     if passes.clocks is not None:
         findings = (*clock_findings(passes.clocks), *model_check.findings)
         model_check = dataclasses.replace(model_check, findings=worst_first(findings))
@@ -298,7 +340,7 @@ def write_tables(
         # The deviations of a rig with such a mistake are its consequences.
         others = () if verdict_of(mistakes) is Level.FAIL else model_check.findings
         verdict = quality.judge(statistics, (*mistakes, *others), noise_scale, pipeline.noise, stretch)
-    return statistics, model_check, verdict
+    return model_check, verdict
 
 
 def rows_of(pipeline: Pipeline, processed: Iterable[Pair]) -> Iterable[Pair]:

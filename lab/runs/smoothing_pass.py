@@ -209,7 +209,8 @@ class SmoothingSummary:
 
 @dataclass(slots=True)
 class TrackingAndSmoothing:
-    """Processes one run. Iterate once over `records()` or `causal_only()`; `smoothing` is complete afterwards.
+    """Processes one run. Iterate over `records()` or `causal_only()`, again only after `leave_out`; `smoothing` is
+    complete afterwards.
 
     folder: where frames are stored between the passes, in an unnamed temporary file.
     """
@@ -263,6 +264,10 @@ class TrackingAndSmoothing:
                 self.pipeline.timings.smoothing += time.perf_counter() - clock
                 yield replace(causal, tracked=tracked, moment=self._at_instants(causal.moment)), causal
                 self._report(k + 1, smoothed.frames, WRITING)
+
+    def leave_out(self, camera: str, frame: int) -> None:
+        """Go through the recording again without the pictures of a camera from a frame on."""
+        self.pipeline = replace(self.pipeline.again(self.pipeline.run, self.pipeline.reader), moved=(camera, frame))
 
     def _at_instants(self, moment: Moment | None) -> Moment | None:
         """A moment whose pictures have their estimated instants."""

@@ -28,7 +28,14 @@ from tracking.rigid_body.hypotheses.hypothesis_set import MAX_CHECKING_SIGMA_PX,
 from tracking.rigid_body.models.information import run_shifts
 from tracking.smoothing.error_scale import ErrorScale, usual_sizes, well_known
 from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
-from tracking.smoothing.labels.neighbouring_frames import connected, displaced, isolated, labelled_once, next_to
+from tracking.smoothing.labels.neighbouring_frames import (
+    connected,
+    displaced,
+    isolated,
+    labelled_once,
+    merged_with_hidden,
+    next_to,
+)
 from tracking.smoothing.labels.reassociation import RunObservation, reassociated, run_log_clutter, run_log_static
 from tracking.smoothing.labels.view_path import PathContext
 from tracking.smoothing.motion.clocks import NARROWER, TURN_SIGMAS, clock_sigmas, clock_step
@@ -233,7 +240,9 @@ class _Smoother:
             jump_sigmas(ref, self.rec.dt_s),
         )  # fmt: skip
         before, likely = self.assigned, probability >= self.parameters.min_label_probability
-        self.assigned = new = np.where(likely & known[:, None], found, -1)
+        expected, _ = project_all(self.views, ref.R, ref.t)
+        new = np.where(likely & known[:, None], found, -1)
+        self.assigned = new = merged_with_hidden(new, expected, self.view_table.camera, self.parameters.blend_px)
         self.measured = self._single_frame_poses(new).measured
         # Where the other frames do not check a label, those of its frame must, or a tracker that was sure of it.
         vague = sigma_px > MAX_CHECKING_SIGMA_PX

@@ -108,6 +108,9 @@ def read_detections(path: Path, named: str | None = None) -> DetectionsFile:
         count = len(table.long_lines)
         why = "more fields than the header has (a comma too many, or a decimal comma)"
         rows.notes.append(f"{path}: {format_count(count, 'line')} left out: {why}")
+    if (short := np.intersect1d(table.lines[rows.good], table.short_lines)).size:
+        what = f"{format_count(len(short), 'line')} with fewer fields than the header, the first in line {short[0]}"
+        rows.notes.append(f"{path}: {what}; their missing fields are taken as empty")
     if not rows.good.any():
         because = "".join(f"; {note.removeprefix(f'{path}: ')}" for note in rows.notes[len(missing) > 0 :])
         raise InputError(f"{path}: expected rows with {', '.join(required)}, got none that can be used{because}")

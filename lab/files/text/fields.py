@@ -242,8 +242,9 @@ def mistakes_in(
 
     folder: the context of the validation, for validators that look for files.
     """
+    has_schema = "schema_" in model.model_fields  # a missing one is named with the value that is expected
     try:
-        return model.model_validate(dict(content), context=folder), []
+        return model.model_validate({**({"schema": None} if has_schema else {}), **content}, context=folder), []
     except pydantic.ValidationError as error:
         return None, [_line(e, path, inside) for e in error.errors()]
 

@@ -119,6 +119,7 @@ class Pipeline:
     on_record: Callable[[FrameRecord], None] | None = None  # called with each record at once
     timings: Timings = field(default_factory=Timings)
     found: FoundPoints | None = None  # where the points of pictures are kept for a further pass
+    moved: tuple[str, int] | None = None  # a camera and the frame from which on its pictures are left out
     _offsets: dict[str, CentroidOffsets] = field(default_factory=dict)
 
     @staticmethod
@@ -197,6 +198,8 @@ class Pipeline:
         missing: list[str] = []
         for name in self.run.rig.cameras:
             picture = frames.images[name]
+            if self.moved is not None and name == self.moved[0] and frames.frame >= self.moved[1]:
+                picture = MissingPicture("left out: the camera has moved")
             if isinstance(picture, np.ndarray):
                 picture = self.spots_in(name, picture)
             if self.found is not None and frames.moment is not None and name in frames.moment.pictures:

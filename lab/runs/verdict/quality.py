@@ -265,16 +265,29 @@ def _why_never(statistics: RunStatistics) -> list[Finding]:
 
 
 def _cameras(statistics: RunStatistics) -> list[Finding]:
-    """Cameras without pictures, or without points of light in them."""
-    out = []
+    """Cameras without pictures, without points of light in them, or that have moved."""
+    out, movement = [], statistics.moved
+    if movement is not None and not movement.left_out:
+        what = (
+            f"from frame {movement.frame} on, spots are not where the poses put them, and the pictures show as many"
+            " points elsewhere: a camera, a screen or a laser has moved, or these poses are wrong"
+        )
+        out.append(finding("BP-V19", Level.FAIL, what, numbers={"frame": movement.frame, "camera": movement.camera}))
     for name, camera in statistics.cameras.items():
         numbers = {"camera": name, **camera.as_mapping()}
-        out += _pictures(name, camera, statistics)
-        if len(moved := camera.moved) >= LEAST_DISPLACED:
+        if movement is not None and movement.left_out and movement.camera == name:
+            what = (
+                f"camera {name} or its screen has moved during the recording, before frame {movement.frame}: its"
+                " pictures from that frame on are not used"
+            )
+            out.append(finding("BP-V19", Level.WARN, what, numbers=numbers))
+        else:
+            out += _pictures(name, camera, statistics)
+        if movement is None and len(moved := camera.moved) >= LEAST_DISPLACED:
             where = f"{format_count(len(moved), 'frame')} ({moved.as_text()})"
             what = (
-                f"camera {name}: in {where} none of its spots is where the other cameras put it: the camera or its"
-                " screen has moved during the recording"
+                f"camera {name}: in {where} its spots are not where the poses put them: the camera or its screen has"
+                " moved during the recording"
             )
             out.append(finding("BP-V19", Level.WARN, what, numbers=numbers))
         if not camera.pictures:

@@ -1,6 +1,6 @@
 """Checks of every frame before it is written, and statistics of a run, counted frame by frame, for verdict and summary.
 
-A frame has valid covariances and a pose that agrees with its spots. Memory does not grow with the run's length.
+A frame has valid covariances and a pose that agrees with its spots. Memory grows by 24 bytes per frame and camera.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from lab.files.run.results import ListedEvent
 from lab.number_format import format_count
 from lab.runs.frames.pipeline import FrameRecord, Pair
+from lab.runs.verdict.moved_camera import MovedCamera, ShownSpots
 from tracking.consistency import SpotAgreement, against_causal, against_own_spots, contradictory, is_covariance
 from tracking.detections import UNMATCHED
 from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame, Word
@@ -243,7 +244,6 @@ MOST_EVENTS = 500  # listed one by one; of the others the number is reported
 LASTING = ("undecided", "changed", CONTRADICTION, "not_a_covariance")
 _USUAL_CLUTTER = 0.95  # quantile, over the measured frames, of the unlabelled points that count as usual clutter
 LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
-_SHOWN = 0.5  # points beyond the usual clutter over expected spots, from which on spots without labels are seen
 _MOST_POINTS = 50  # larger numbers of unlabelled points are counted as this number
 
 
@@ -282,23 +282,15 @@ class CameraStatistics:
     missing_reasons: Counter[str] = field(default_factory=Counter)
     # Measured frames in which this camera's spots have labels and none of them fits the pose of the other cameras.
     displaced: FrameRanges = field(default_factory=FrameRanges)
-    # Measured frames in which none of two or more expected spots has a label.
-    without_labels: FrameRanges = field(default_factory=FrameRanges)
-    _points_without: Counter[str] = field(default_factory=Counter)  # in those frames: points, expected spots
-    _clutter: Counter[str] = field(default_factory=Counter)  # in frames with labels: points without one, frames
+    spots: ShownSpots = field(default_factory=ShownSpots)
 
     @property
     def moved(self) -> FrameRanges:
-        """Frames in which the spots of this camera are seen, and none is where the pose of the others puts it.
-
-        Spots without labels are seen if there are more points than the clutter of frames with labels, by half as many
-        as spots are expected; hidden spots leave the clutter alone.
-        """
-        if len(self.displaced) >= LEAST_DISPLACED or not self._clutter["frames"]:
-            return self.displaced
-        clutter = self._clutter["points"] / self._clutter["frames"] * len(self.without_labels)
-        shown = self._points_without["points"] - clutter > _SHOWN * self._points_without["expected"]
-        return self.without_labels if shown and len(self.without_labels) >= LEAST_DISPLACED else self.displaced
+        """Frames in which spots of this camera are shown, and not where the pose puts them."""
+        astray = FrameRanges()
+        for frame in self.spots.frames_astray().tolist():
+            astray.add(frame)
+        return astray if len(astray) >= LEAST_DISPLACED > len(self.displaced) else self.displaced
 
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json."""
@@ -361,6 +353,7 @@ class RunStatistics:
     events: Events = field(default_factory=Events)
     first_pose: Pose | None = None  # the first that is measured
     first_measured: int = -1  # its frame
+    moved: MovedCamera | None = None  # a movement during the run
     _found: bool = False  # whether a pose has been found
     _causes: Counter[tuple[FrameCause, int]] = field(default_factory=Counter)  # with the number of unlabelled points
     _surplus: Counter[int] = field(default_factory=Counter)  # unlabelled points of measured frames
@@ -408,7 +401,7 @@ class RunStatistics:
                 self.tie_text = self.tie_text or event.text
 
     def _add_cameras(self, record: FrameRecord) -> None:
-        status, used = record.tracked.status, record.tracked.used_in_pose
+        status = record.tracked.status
         pictures = zip(self.cameras.items(), record.detections, record.missing, strict=True)
         for (name, camera), found, reason in pictures:
             if found is None:
@@ -425,6 +418,9 @@ class RunStatistics:
             else:
                 camera.empty_at_end += 1
             if record.tracked.pose is not None:
+                measured = record.tracked.pose_status is PoseStatus.MEASURED
+                if camera.spots.add(record.frame, record.tracked, views, found) and measured:
+                    camera.displaced.add(record.frame)
                 own = [status[v] for v in views]
                 camera.found += sum(s.measured for s in own)
                 expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)
@@ -432,16 +428,6 @@ class RunStatistics:
                 camera.unlabelled += 2 <= expected <= len(found) and not any(s.measured for s in own)
                 camera.expected_at_start += expected if camera.points == 0 else 0
                 camera.expected_at_end += expected if camera.empty_at_end else 0
-                labelled = [v for v in views if status[v].measured]
-                if record.tracked.pose_status is not PoseStatus.MEASURED:
-                    continue
-                if labelled:
-                    camera._clutter.update(frames=1, points=len(found) - len(labelled))
-                    if used is not None and not used[labelled].any():
-                        camera.displaced.add(record.frame)
-                elif expected >= 2:
-                    camera.without_labels.add(record.frame)
-                    camera._points_without.update(points=len(found), expected=expected)
 
     def _cause(self, record: FrameRecord) -> FrameCause:
         tracked = record.tracked

@@ -48,6 +48,21 @@ def test_a_correct_set_up_raises_no_alarm(scene):
     assert result.diagnosis.p_before > 1e-4
 
 
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_camera_that_moves_during_a_recording_is_found_with_its_frame(scene, moves):
+    """A constant fault of the same size is no movement."""
+    run, before = recorded(scene, 5, frames=200)
+    _, after = recorded(scene, 5, frames=200, really=turned(one_camera(scene), 0.3, 1))
+    late = np.arange(200) >= (120 if moves else 0)
+    both = dataclasses.replace(before, uv_px=np.where(late[:, None, None], after.uv_px, before.uv_px))
+    found = evaluate_model(run.rig, both).moved_at_s
+    if moves:
+        assert found == pytest.approx(before.t_s[120], abs=2.5 * (before.t_s[1] - before.t_s[0]))
+    else:
+        assert found is None
+
+
 @pytest.mark.slow
 def test_two_hundred_correct_recordings_raise_no_alarm_and_their_p_values_are_uniform():
     """Alarms are too rare to count (1e-6 each); uniform p-values show that the stated rate is correct."""
@@ -57,6 +72,7 @@ def test_two_hundred_correct_recordings_raise_no_alarm_and_their_p_values_are_un
             run, recording = recorded(scene, 1000 + seed, frames=250)
             result = evaluate_model(run.rig, recording)
             assert not raises_alarm(result), (scene, seed)
+            assert result.moved_at_s is None, (scene, seed)
             assert result.diagnosis is not None
             p.append(result.diagnosis.p_before)
     below = [np.mean(np.array(p) < limit) for limit in (0.05, 0.5)]

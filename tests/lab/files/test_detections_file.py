@@ -106,6 +106,15 @@ def test_an_unusable_row_is_left_out_and_noted(bad, why, found, tmp_path):
     assert [n.split(": ", 1)[1] for n in file.notes] == [f"1 of 2 rows left out: {why} (the first in line 3{shown})"]
 
 
+def test_a_line_that_is_cut_short_after_its_point_is_used_and_noted(tmp_path):
+    cut = row(1, "left", 5, 6).rsplit(",", 2)[0]
+    file = read_detections(table(tmp_path, row(0, "left", 5, 6), cut, row(2, "left", 5, 6)))
+    assert list(file.cameras["left"].frames) == [0, 1, 2]
+    assert [n.split(": ", 1)[1] for n in file.notes] == [
+        "1 line with fewer fields than the header, the first in line 3; their missing fields are taken as empty"
+    ]
+
+
 def test_a_line_with_too_many_fields_is_left_out_and_noted(tmp_path):
     file = read_detections(table(tmp_path, row(0, "left", 5, 6), row(1, "left", 5, 6) + ",7,8", row(2, "left", 5, 6)))
     assert list(file.cameras["left"].frames) == [0, 2]

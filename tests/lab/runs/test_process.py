@@ -17,9 +17,11 @@ import yaml
 
 from geometry.forward_model import SpotModel
 from geometry.pose import Pose
+from geometry.rotations import matrix_from_quaternion
 from lab.errors import InputError, RunError
 from lab.files.run.results import POSE_STATUSES, are_results, read_poses, read_spots
 from lab.files.run.run_file import load_run
+from lab.files.run.truth import read_true_poses
 from lab.files.text import columns
 from lab.files.text.json_text import plain_value
 from lab.runs import process, processed, smoothing_pass
@@ -27,6 +29,7 @@ from lab.runs.batch.batch import process_batch
 from lab.runs.frames.pipeline import FrameRecord, Pipeline
 from lab.runs.process import process_run
 from lab.runs.smoothing_pass import SMOOTHING, TRACKING, WRITING, TrackingAndSmoothing
+from lab.runs.verdict.moved_camera import MovedCamera
 from lab.runs.verdict.quality import LEAST_MEASURED
 from lab.runs.verdict.run_statistics import CameraStatistics, RunStatistics
 from lab.runs.verdict.score import normalised_squares
@@ -762,6 +765,59 @@ def test_a_camera_that_moves_so_far_that_its_spots_lose_their_labels_is_named(th
     moved = [f.what for f in outcome.verdict.findings if f.code == "BP-V19"]
     assert [w for w in moved if text is None or text not in w] == []
     assert len(moved) == (text is not None)
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 2.0, 25.0])
+def test_poses_after_a_knock_of_one_of_two_cameras_do_not_use_its_pictures(shift_px, tmp_path):
+    """The other camera and the motion give them; they were beyond 10 sigmas, at CHECK or even PASS."""
+    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=90, detections_only=True)
+    points = pd.read_csv(run_folder / "detections.csv")
+    points.loc[(points.camera == "right") & (points.frame >= 45), ["u_px", "v_px"]] += np.array([1.0, -0.6]) * shift_px
+    points.to_csv(run_folder / "detections.csv", index=False)
+    outcome = process_run(run_folder, tmp_path / "out")
+    named = [(f.level.name, f.what) for f in outcome.verdict.findings if f.code == "BP-V19"]
+    if not shift_px:
+        assert outcome.result.moved is None
+        assert named == []
+        return
+    assert outcome.result.moved == MovedCamera(45, "right", left_out=True)
+    assert [
+        level for level, what in named if "before frame 45: its pictures from that frame on are not used" in what
+    ] == ["WARN"]
+    truth = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["errors"]["pose"]["measured"]
+    assert truth["rows"] >= 45
+    assert truth["beyond_10_sigmas"] == 0
+
+
+def test_the_point_of_two_spots_that_have_merged_does_not_shift_the_poses(tmp_path):
+    """A second laser beside the first one: the table has one point between both, and states the sigma of a spot."""
+    run_folder = simulate("huo2015", tmp_path / "run", seed=6, frames=60, detections_only=True)
+    rig = yaml.safe_load((run_folder / "rig.yaml").read_text("utf-8"))
+    name, beam = next(iter(rig["target"]["beams"].items()))
+    direction = np.add(beam["direction"], [0.0, 0.0, 0.0015])
+    rig["target"]["beams"]["beside"] = {**beam, "direction": (direction / np.linalg.norm(direction)).tolist()}
+    spot, of = next((s, of) for s, of in rig["target"]["spots"].items() if of["beam"] == name)
+    rig["target"]["spots"]["beside"] = {**of, "beam": "beside"}
+    (run_folder / "rig.yaml").write_text(yaml.safe_dump(rig), "utf-8")
+    model = SpotModel.of(load_run(run_folder).rig)
+    truth = read_true_poses(run_folder / "truth" / "pose.csv")
+    uv, _ = model.project(Pose(matrix_from_quaternion(truth.quaternion_wxyz), truth.position_m))
+    camera = next(c for c, s in model.views if s == spot)
+    one, two = uv[:, model.views.index((camera, spot))], uv[:, model.views.index((camera, "beside"))]
+    points = pd.read_csv(run_folder / "detections.csv")
+    of_camera = points[points.camera == camera]
+    off = np.linalg.norm(of_camera[["u_px", "v_px"]].to_numpy() - one[of_camera.frame], axis=1)
+    merged = of_camera.index[off < 1.5]
+    frames = points.loc[merged, "frame"]
+    points.loc[merged, ["u_px", "v_px"]] += (two - one)[frames] / 2
+    points.to_csv(run_folder / "detections.csv", index=False)
+    assert len(merged) > 40
+    assert np.median(np.linalg.norm(two - one, axis=1)) == pytest.approx(1.5, abs=1.2)
+    outcome = process_run(run_folder, tmp_path / "out")
+    assert outcome.result.measured > 50
+    measured = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["errors"]["pose"]["measured"]
+    print(measured)
+    assert measured["nees_mean"] < 9  # of 6
 
 
 def test_a_camera_whose_screen_gets_no_spot_is_used_without_a_warning(three_cameras, tmp_path, recwarn):

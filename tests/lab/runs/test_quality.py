@@ -8,6 +8,7 @@ import pytest
 
 from lab.findings.finding import Finding, Level, Verdict, entries, finding
 from lab.runs.frames.sensor_noise import CameraNoise
+from lab.runs.verdict.moved_camera import MovedCamera
 from lab.runs.verdict.quality import GOOD_MEASURED, LEAST_DISPLACED, LEAST_MEASURED, LEAST_MEASURED_OF_SHOWN, judge
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
 
@@ -297,6 +298,15 @@ def test_a_camera_that_moved_during_the_recording_is_a_point_to_check(frames, st
     if status == "check":
         assert kinds(verdict) == ["camera_moved"]
         assert "camera left: in 5 frames (500 to 504)" in verdict.texts[0]
+
+
+@pytest.mark.parametrize(("moved", "status"), [(MovedCamera(40, "left", True), "check"), (MovedCamera(40, ""), "fail")])
+def test_a_movement_fails_where_it_is_not_known_which_camera_to_leave_out(moved, status):
+    statistics = statistics_of(cameras={"left": a_camera(), "right": a_camera()})
+    statistics.moved = moved
+    verdict = judge(statistics)
+    assert (verdict.status, kinds(verdict)) == (status, ["camera_moved"])
+    assert "frame 40" in verdict.texts[0]
 
 
 @pytest.mark.parametrize(("kept", "status"), [(0.008, "pass"), (0.5, "check"), (float("nan"), "check")])

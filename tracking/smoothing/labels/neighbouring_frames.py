@@ -1,8 +1,8 @@
-"""Labels judged by the frames next to them: isolated ones, and those of a camera that was knocked."""
+"""Labels judged by their neighbours: isolated ones, those of merged spots, and those of a camera that was knocked."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import pairwise, permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,22 @@ def connected(measured: Bools, confirmed: Bools) -> Bools:
     for order in (range(1, len(out)), range(len(out) - 2, -1, -1)):
         for k in order:
             out[k] |= measured[k] and out[k - order.step]
+    return out
+
+
+def merged_with_hidden(assigned: Ints, expected_px: Array, camera: Ints, reach_px: float) -> Ints:
+    """Assignments (T, n), plus BLENDED where a point is the light of two spots.
+
+    A spot that is not found beside another one, nearer than a detector separates two lights, has merged with it or is
+    hidden; that one's point may be anywhere between both. expected_px (T, n, 2): pixels at the poses; camera (n,).
+    """
+    out = assigned.copy()
+    for one, other in permutations(range(len(camera)), 2):
+        if camera[one] == camera[other]:
+            near = np.linalg.norm(expected_px[:, one] - expected_px[:, other], axis=-1) < reach_px
+            out[near & (assigned[:, one] >= 0) & (assigned[:, one] < BLENDED) & (assigned[:, other] < 0), one] += (
+                BLENDED
+            )
     return out
 
 

@@ -194,7 +194,7 @@ BROKEN = [
         "schema: beampose/rig/2",
         "rig.yaml: schema: expected 'beampose/rig/1', got 'beampose/rig/2'",
     ),
-    ("schema: beampose/rig/1\n", "", "rig.yaml: schema: expected a value, got nothing"),
+    ("schema: beampose/rig/1\n", "", "rig.yaml: schema: expected 'beampose/rig/1', got nothing"),
     (
         "schema: beampose/rig/1",
         "schema: [",

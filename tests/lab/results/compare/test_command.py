@@ -39,6 +39,15 @@ def test_a_comparison_without_out_prints_and_writes_nothing(tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_a_result_is_compared_with_itself_in_readable_numbers(tmp_path):
+    """Rounding errors printed thirty zeros."""
+    result = write_results(tmp_path / "one", recordings(1)[0])
+    done = CliRunner().invoke(main, ["compare", str(result), str(result)])
+    assert done.exit_code == 0, done.output
+    assert "chi-square per degree of freedom" in done.stdout
+    assert "000000" not in done.stdout
+
+
 def test_how_many_frames_are_within_their_limit_is_stated_against_a_reference_alone(tmp_path):
     """The errors of two results can have the same causes, so that no share of them is to be expected."""
     mine, theirs = recordings(1, truth=SIMPLE)
