@@ -192,7 +192,14 @@ class _Problem:
             np.unique(self.term.placement),
             np.concatenate([*known, np.zeros((0, shared.shape[-1]))]),
             int(starts[2]) + 6,
+            self.places,
         )
+
+    @property
+    def places(self) -> Array:
+        """(N, 3): of the corners on the board, in spacings, those of the second camera far from those of the first."""
+        apart = 1e6 * self.term.camera[:, None]  # spacings: errors in two cameras are independent
+        return np.concatenate([self.term.points[:, :2] / self.single[0].table.spacing_m, apart], axis=1)
 
     @property
     def bent(self) -> bool:

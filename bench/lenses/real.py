@@ -254,6 +254,7 @@ def _solved_part(equations: ViewEquations, prior: Array, which: Bools) -> tuple[
     part = replace(
         equations,
         information=T.T @ equations.information[which] @ T,
+        correlated=T.T @ equations.noise[which] @ T,
         gradient=(equations.gradient[which] + equations.information[which] @ y) @ T,
         views=equations.views[which],
         basis=equations.basis @ T,

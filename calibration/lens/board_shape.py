@@ -13,6 +13,7 @@ fixed by wide priors instead of by three chosen points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -22,7 +23,7 @@ from scipy.special import chdtrc
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.coverage import seen_at
-from calibration.lens.fit.lens_adjustment import BRIEF, term_of
+from calibration.lens.fit.lens_adjustment import BRIEF, ROUGH, term_of
 from calibration.lens.fit.lens_fit import LensFit, fit
 from calibration.lens.fit.lens_parameters import AS_STATED, BoardFreedom, board_as_stated
 from calibration.lens.fit.model_selection import difference_px
@@ -116,8 +117,9 @@ def board_test(table: CornerTable, found: LensFit, options: BoardShapeOptions = 
     """
     # The board as stated, its circles as measured.
     stated = {**board_as_stated(len(table.board_points)), "radius": found.values["radius"]}
-    flat = fit(table, found.used, found.model, {**found.values, **stated}, AS_STATED, limits=BRIEF)
-    bent = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True), limits=BRIEF)
+    # Of a board far from its statement the steps remain short ones: the evidence is linear about where they end.
+    flat = fit(table, found.used, found.model, {**found.values, **stated}, AS_STATED, limits=ROUGH)
+    bent = fit(table, flat.used, flat.model, flat.values, BoardFreedom(warp=True), limits=ROUGH)
     test = _Evidence.of(table, bent)
     warp, why = test.bent()
     if options.warp is not None:
@@ -157,6 +159,7 @@ class _Evidence:
     shape: Array  # (5,) or, where the scale is not determined, (3,)
     covariance: Array
     halves: tuple[tuple[Array, Array], ...]  # the same two of each half; empty if a half does not determine them
+    without: tuple[tuple[Array, Array], ...]  # the same two without each photograph; empty if one is indispensable
     scatter: Scatter
 
     @staticmethod
@@ -174,12 +177,15 @@ class _Evidence:
         spread = equations.moved(change).scatter()
         raised = max(1.0, spread.factor) ** 2
         odd = np.arange(len(equations.views)) % 2 == 1
-        try:
-            both = [equations.solution(which) for which in (odd, ~odd)]
-            halves = tuple((start + d[at], c[at, at] * raised) for d, c in both)
-        except AdjustmentError:
-            halves = ()
-        return _Evidence(start + change[at], C[at, at] * raised, halves, spread)
+
+        def of_sets(sets: Sequence[Bools]) -> tuple[tuple[Array, Array], ...]:
+            try:
+                return tuple((start + d[at], c[at, at] * raised) for d, c in map(equations.solution, sets))
+            except AdjustmentError:
+                return ()
+
+        without = of_sets(list(~np.eye(len(odd), dtype=bool)))
+        return _Evidence(start + change[at], C[at, at] * raised, of_sets((odd, ~odd)), without, spread)
 
     @property
     def p_warp(self) -> float:
@@ -190,9 +196,18 @@ class _Evidence:
         return _p_value(self.shape[_STRETCH], self.covariance[_STRETCH, _STRETCH])
 
     def _in_both_halves(self, part: slice) -> bool:
-        return len(self.halves) == 2 and all(
-            _p_value(x[part], C[part, part]) < HALF_SIGNIFICANT for x, C in self.halves
-        )
+        """Whether both halves show it. A half of few photographs that cannot show what all do need only agree.
+
+        No photograph may then be the one that shows it.
+        """
+        if len(self.halves) < 2:
+            return False
+        shown = [_p_value(x[part], C[part, part]) < HALF_SIGNIFICANT for x, C in self.halves]
+        able = [_p_value(self.shape[part], C[part, part]) < HALF_SIGNIFICANT for _, C in self.halves]
+        agree = [_p_value((x - self.shape)[part], C[part, part]) >= HALF_SIGNIFICANT for x, C in self.halves]
+        others = [_p_value(x[part], C[part, part]) < SIGNIFICANT for x, C in self.without]
+        few = bool(others) and all(others) and all(agree)
+        return all(s or (few and not a) for s, a in zip(shown, able, strict=True))
 
     def bent(self) -> tuple[bool, str]:
         """Whether the board is bent, and why, or why not."""
@@ -211,7 +226,7 @@ class _Evidence:
         return True, f"{_IN_HALVES}, and it explains them"
 
 
-_IN_HALVES = "significant in both halves of the photographs"
+_IN_HALVES = "significant, and both halves of the photographs agree on it"
 _NOT_IN_HALVES = "significant, but not in both halves of the photographs"
 
 

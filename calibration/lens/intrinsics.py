@@ -103,7 +103,7 @@ class Intrinsics:
     parameters: tuple[str, ...]  # fx, fy, cx, cy, k1 ...
     covariance: Array  # (p, p) in that order; with scatter between photographs, an unsolved bend and model error
     model_uncertainty: ModelUncertainty
-    correlated_noise: float  # factor on the sigmas from that scatter; 1 where it is not significant
+    correlated_noise: float  # factor on the sigmas from that scatter and from the correlation of neighbouring corners
     scatter: Scatter
     held_out_rms_px: float  # per coordinate, of corners in photographs that the lens was predicted without
     selection: ModelSelection
@@ -218,7 +218,7 @@ def _calibrated(table: CornerTable, options: IntrinsicsOptions) -> Intrinsics:
     selection = select_model(table, used, rich, board, replace(free, points=False), options.lens)
     found, equations = _final(table, selection.chosen, free)
     spread = equations.scatter()
-    noise = spread.factor if spread.is_significant else 1.0
+    noise = spread.raised
     distance = options.distance_m or _typical_depth(table, found)
     seen = partial(seen_at, table, found.used)
     pixel_map = projection_map(found.model, found.lens, table.image_size_px, distance, where=seen)

@@ -205,6 +205,7 @@ _MODEL_SIGMA_PX = 0.005  # of the fit: rims are not exact circles
 # Length of rim with one period of the errors that show the power of one turn, and least number of these in the rim. Of
 # 800 circles of four kinds NEES / 2 is 1.08, 1.02 and .99 with 30, 40 and 50 px.
 _PERIOD_PX, _LEAST_PERIODS = 40.0, 4.0
+_SAME_FOR_ALL = np.linspace(0.0, 1.0, 11)  # shares of the variance of the usual edge that no slope changes
 _BLUR_SIGMA = 0.5  # 1 sigma of the correction for blur, as a share of it
 _ELLIPSE_COVERAGE = 0.7  # share of the rim that determines an ellipse
 _ELLIPSE_F = 8.0  # F value of its two parameters, above which they are kept
@@ -412,14 +413,14 @@ def _described(
     if coverage < min_coverage:
         return None
     oblique = bool(rim.cos2_px or rim.sin2_px)
-    precision = points.precision
+    precision = _precision(points.precision, _residuals(rim, points), good)
     A = (_design(points, oblique) * precision[:, None])[good]
     away = _residuals(points.about, points) * precision
     prior = _prior(points, float(np.std(away[good])), A.shape[1])
     weighted = A * weight[good, None]
     x = np.linalg.solve(weighted.T @ A + prior, weighted.T @ away[good])
     away[good] -= A @ x
-    power = _error_power(np.where(good, away, 0.0), good, points.spacing_px)
+    power = _error_power(np.where(good, away, 0.0), good, points.spacing_px, A)
     covariance = np.asarray(power * np.linalg.inv(A.T @ A + prior), float)
     lasting = max(1 - points.noise_px**2 * max(CORRELATED_PX / points.spacing_px, 1.0) / power, 0.0)
     covariance = symmetric(covariance[:3, :3]) + _MODEL_SIGMA_PX**2 * np.eye(3)
@@ -434,11 +435,25 @@ def _described(
     return RimFit(best, covariance, coverage, rms, beside, coarse.polarity, score, sectors, lasting)
 
 
-def _error_power(away: Array, good: Bools, spacing_px: float) -> float:
+def _precision(by_slope: Array, residuals: Array, good: Bools) -> Array:
+    """(n,): of each edge, from that by its slope: a share of the variance is the same for all, by maximum likelihood.
+
+    Interpolation and texture of the same slope move edges of any height alike. Errors of textured rims grow with the
+    power -.5 of the slope, not -1: weights of 1 / slope gave NEES / 2 of 1.7 where the contrast is low.
+    """
+    noise2 = 1 / by_slope**2
+    variance = _SAME_FOR_ALL[:, None] + (1 - _SAME_FOR_ALL[:, None]) * noise2[good]
+    deviance = np.log(np.mean(residuals[good] ** 2 / variance, axis=1)) + np.mean(np.log(variance), axis=1)
+    same = _SAME_FOR_ALL[np.argmin(deviance)]
+    return np.asarray(1 / np.sqrt(same + (1 - same) * noise2))
+
+
+def _error_power(away: Array, good: Bools, spacing_px: float, design: Array) -> float:
     """Variance of an edge point, px^2, times the number of neighbours that count as one: of the errors (n,) of a fit.
 
     It is the power of the errors at one period per turn, which moves a centre. The fit leaves nothing there: it is
-    that of more periods, with weights that fall to .6 where one is _PERIOD_PX long. Estimated like this, a variance is
+    that of more periods, with weights that fall to .6 where one is _PERIOD_PX long; with gaps in the rim, the fit takes
+    up a part of these as well (design: (m, 3 to 6) of the good points). Estimated like this, a variance is
     divided by its degrees of freedom less 2, as that of Student's distribution. At least 1.8 points 1 px apart count as
     one, measured: white noise behind the Gaussian filter has the correlation exp(-d^2 / 4 sigma^2), whose sum is 3.5,
     but the errors of pixels and interpolation are less correlated.
@@ -448,6 +463,9 @@ def _error_power(away: Array, good: Bools, spacing_px: float) -> float:
     periods = np.arange(len(spectrum))
     shown = max(len(away) * spacing_px / _PERIOD_PX, _LEAST_PERIODS)
     share = np.exp(-0.5 * (periods / shown) ** 2) * (periods >= 2)
+    fitted = np.zeros((len(away), design.shape[1]))
+    fitted[good] = np.linalg.qr(design)[0]
+    left = np.sum(share) - share @ np.sum(np.abs(np.fft.rfft(fitted, axis=0)) ** 2, axis=1) / count
     freedom = 2 * share.sum() ** 2 / (share @ share) * count / len(away)
-    power = float(share @ spectrum / share.sum() * freedom / max(freedom - 2, 1.0))
+    power = float(share @ spectrum / left * freedom / max(freedom - 2, 1.0))
     return max(power, max(1.8 / spacing_px, 1.0) * max(float(away @ away) / count, _LEAST_SIGMA_PX**2))

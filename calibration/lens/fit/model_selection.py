@@ -238,7 +238,7 @@ def _judged(table: CornerTable, candidate: ModelCandidate) -> _Judged:
         candidate,
         map=at,
         inside=inside,
-        scatter=spread.factor,
+        scatter=max(spread.factor, spread.correlated),
         scatters=spread.is_significant,
         noise_px=found.sigma_px,
         coordinates=int(equations.count.sum()),

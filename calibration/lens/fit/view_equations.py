@@ -8,7 +8,7 @@ adjustment: a modern synthesis", section 6.1).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -16,6 +16,7 @@ from scipy.special import chdtrc, chdtri
 
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.lens.fit.corner_table import CornerTable
+from calibration.lens.fit.correlated_noise import correlations
 from calibration.lens.fit.lens_adjustment import prior_terms, term_of
 from calibration.lens.fit.lens_fit import LensFit, used_views
 from calibration.lens.fit.lens_parameters import BoardFreedom
@@ -39,9 +40,15 @@ _UNDETERMINED = 1e-9  # relative size of a pivot below which a direction of the 
 class Scatter:
     """Whether photographs pull the shared unknowns apart by more than the noise of their corners explains."""
 
-    factor: float  # on the sigmas that explains it; about 1 for a good model
+    factor: float  # on the sigmas of independent corners that explains it; about 1 for a good model
     p_value: float  # of at least as much scatter, if model and noise are right
-    is_significant: bool  # whether it widens the sigmas
+    is_significant: bool  # whether it widens the sigmas beyond what the correlation of neighbours does
+    correlated: float = 1.0  # factor on the sigmas of independent corners by the correlation of neighbours
+
+    @property
+    def raised(self) -> float:
+        """Factor on the sigmas of independent corners that the photographs show."""
+        return self.factor if self.is_significant else self.correlated
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +65,17 @@ class ViewEquations:
     views: Ints  # (V,): their numbers in the table
     basis: Array  # (q, q)
     lens: int  # p
+    correlated: Array | None = None  # (V, q, q): covariance of the gradients; None: corners are independent
+
+    @property
+    def noise(self) -> Array:
+        """(V, q, q): covariance of each view's gradient at the true unknowns, by the noise of its corners."""
+        return self.information if self.correlated is None else self.correlated
+
+    @property
+    def noise_of_sum(self) -> Array:
+        """(q, q): the same of the sum over all views and the prior."""
+        return np.asarray(np.eye(len(self.basis)) + np.sum(self.noise - self.information, axis=0))
 
     @staticmethod
     def of(table: CornerTable, found: LensFit, board: BoardFreedom | None = None) -> ViewEquations:
@@ -72,26 +90,29 @@ class ViewEquations:
         shared = _shared(parts, model.free, board, table.circles is not None)
         known = _prior_rows(table, found, shared.shape[-1])
         view = table.view[found.used]
+        places = table.points[found.used] / table.spacing_m
         return ViewEquations.of_rows(
-            shared, parts["boards"], line.residuals, view, views, known, int(model.free.sum())
+            shared, parts["boards"], line.residuals, view, views, known, int(model.free.sum()), places
         )  # fmt: skip
 
     @staticmethod
     def of_rows(
-        shared: Array, boards: Array, residuals: Array, view: Ints, views: Ints, known: Array, lens: int
+        shared: Array, boards: Array, residuals: Array, view: Ints, views: Ints, known: Array, lens: int, places: Array
     ) -> ViewEquations:
         """From derivatives by the shared unknowns (N, 2, q) and by the pose of each view's board (N, 2, 6).
 
-        residuals (N, 2), in sigmas; view (N,): of each corner; known (n, q): rows of priors; lens: p. Raises
-        AdjustmentError: the views do not determine the unknowns.
+        residuals (N, 2), in sigmas; view (N,): of each corner; known (n, q): rows of priors; lens: p; places
+        (N, k): of the corners on the board, in spacings. Raises AdjustmentError: the views do not determine the
+        unknowns.
         """
-        rows, misses = [], []
+        rows, misses, poses = [], [], []
         for v in views:
             mine = view == v
             J, r = shared[mine].reshape(-1, shared.shape[-1]), residuals[mine].ravel()
             Q = np.linalg.qr(boards[mine].reshape(-1, 6))[0]
             rows.append(J - Q @ (Q.T @ J))
             misses.append(r - Q @ (Q.T @ r))
+            poses.append(Q)
         J = np.concatenate([*rows, known])
         scale = np.linalg.norm(J, axis=0)
         if not np.all(scale > 0):
@@ -101,6 +122,7 @@ class ViewEquations:
             raise AdjustmentError("the views do not determine every unknown")
         basis = solve_triangular(R, np.eye(len(R))) / scale[:, None]
         own = [A @ basis for A in rows]
+        alike = correlations(misses, poses, [places[view == v] for v in views])
         return ViewEquations(
             information=np.stack([A.T @ A for A in own]),
             gradient=np.stack([A.T @ r for A, r in zip(own, misses, strict=True)]),
@@ -109,6 +131,9 @@ class ViewEquations:
             views=views,
             basis=basis,
             lens=lens,
+            correlated=None
+            if alike is None
+            else np.stack([_covariance(A, K) for A, K in zip(own, alike, strict=True)]),
         )
 
     def solution(self, which: Bools | None = None) -> tuple[Array, Array]:
@@ -156,9 +181,7 @@ class ViewEquations:
         y = np.linalg.solve(self.basis, change)
         by = self.information @ y
         chi = self.chi2 + 2 * self.gradient @ y + by @ y
-        return ViewEquations(
-            self.information, self.gradient + by, chi, self.count, self.views, self.basis, self.lens
-        )  # fmt: skip
+        return replace(self, gradient=self.gradient + by, chi2=chi)
 
     def held_out_px2(self) -> Array:
         """(V,): squared error per coordinate, in units of the noise, of each view when it is held out."""
@@ -197,9 +220,9 @@ class ViewEquations:
         6.4.9.4) with its degrees of freedom (Bell and McCaffrey 2002, Survey Methodology 28): some 3 of 5 photographs,
         where the widening is 1.7, and 10 of 25.
         """
-        S = self.information
+        S, G = self.information, self.noise
         if not spread.is_significant:
-            return self.basis @ self.basis.T
+            return self.basis @ self.noise_of_sum @ self.basis.T
         share, vectors = np.linalg.eigh(S)
         held_out = (vectors / (1 - np.minimum(share, _MOST_BY_ONE))[:, None]) @ np.swapaxes(vectors, 1, 2)
         changes = (held_out @ self.gradient[..., None])[..., 0]
@@ -207,9 +230,10 @@ class ViewEquations:
         along = held_out @ axes  # (V, q, q): the change along an axis is its column times the gradient
         # What is expected if every photograph has unknowns of its own, so much apart that they explain the factor.
         squared = S @ S
-        noise, apart = np.trace(S - squared, axis1=1, axis2=2).sum(), np.sum(squared, axis=0)
+        noise, apart = np.trace(self._at_solution(), axis1=1, axis2=2).sum(), np.sum(squared, axis=0)
         own = np.trace(squared - 2 * squared @ S + S @ apart @ S, axis1=1, axis2=2).sum()
-        gradients = S + (spread.factor**2 - 1) * noise / own * squared  # their covariances; of their sum:
+        beyond = (spread.factor / spread.correlated) ** 2
+        gradients = G + (beyond - 1) * noise / own * squared  # their covariances; of their sum:
         error = np.sum(gradients, axis=0)
         by_own, by_sum = gradients @ along, S @ along
         # (q, V, V): covariances of these changes; at the solution of all a gradient lacks its view's share of the sum.
@@ -221,30 +245,44 @@ class ViewEquations:
         ratio = np.einsum("ik,ij,jk->k", axes, error, axes) / expected
         jackknife = (axes * squares * ratio * dof / (dof - 2)) @ axes.T
         known = len(S) / (len(S) + len(axes))
-        raised = (1 - known) * spread.factor**2 * np.eye(len(axes)) + known * jackknife
+        raised = (1 - known) * beyond * self.noise_of_sum + known * jackknife
         return self.basis @ raised @ self.basis.T
 
     def scatter(self) -> Scatter:
-        """Compare the gradients of single views with their covariance S - S S, which they have at the solution of all.
+        """Compare the gradients of single views with the covariance that noise gives them at the solution of all.
 
         Errors that are correlated within a photograph (a board that bends differently each time, blur, a lens that the
         model cannot describe) increase them. Compared as sums over views and directions of equal information, and with
         the chi-square distribution of the same mean and variance (Satterthwaite 1946): the sandwich estimate of White
         (1980, Econometrica 48) for clusters, reduced to one factor.
         """
-        S = self.information
-        C = S - S @ S
+        S, G = self.information, self.noise
+        C = self._at_solution()
         measured = float(np.sum(self.gradient**2))
         expected = float(np.trace(C, axis1=1, axis2=2).sum())
-        # The gradients sum to zero: those of different views have the covariance -S_u S_v.
-        squared = S @ S
-        squares = float(np.sum(C**2) + np.sum(np.sum(squared, axis=0) ** 2) - np.sum(squared**2))
+        # The gradients sum to zero: those of different views u, v have the covariance S_u F_v + F_u' S_v.
+        F = 0.5 * self.noise_of_sum @ S - G
+        Ft, FS = np.swapaxes(F, 1, 2), F @ S
+        both = np.sum(S @ S, axis=0) @ np.sum(F @ Ft, axis=0) + np.linalg.matrix_power(np.sum(FS, axis=0), 2)
+        squares = float(np.sum(C**2) + 2 * np.trace(both) - np.sum((np.swapaxes(FS, 1, 2) + FS) ** 2))
         dof = expected**2 / max(squares, 1e-300)
         ratio = measured / expected if expected > 0 else 1.0
         p = float(chdtrc(dof, ratio * dof))
         five, all_views = (n * (np.log(n) + chdtri(1, _SCATTER_SIGNIFICANT)) for n in (5, len(S)))
         limit = _SCATTER_SIGNIFICANT * float(np.sqrt(five / all_views))
-        return Scatter(float(np.sqrt(ratio)), p, ratio > 1 and p < limit)
+        independent = float(np.trace(S - S @ S, axis1=1, axis2=2).sum())
+        correlated = float(np.sqrt(expected / independent)) if independent > 0 else 1.0
+        return Scatter(float(np.sqrt(ratio)) * correlated, p, ratio > 1 and p < limit, correlated)
+
+    def _at_solution(self) -> Array:
+        """(V, q, q): covariance of each view's gradient at the solution of all, which their sum has moved."""
+        S, by_sum = self.information, self.information @ self.noise
+        return self.noise - by_sum - np.swapaxes(by_sum, 1, 2) + S @ self.noise_of_sum @ S
+
+
+def _covariance(by_unknowns: Array, correlation: Array) -> Array:
+    """(q, q) of a view's gradient from derivatives (2 n, q), u and v in turn, and the correlation (n, n) of corners."""
+    return np.asarray(sum(A.T @ correlation @ A for A in (by_unknowns[::2], by_unknowns[1::2])))
 
 
 def scattered(found: LensFit, equations: ViewEquations, spread: Scatter) -> Array:

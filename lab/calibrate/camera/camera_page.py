@@ -239,14 +239,14 @@ def _origins(c: Intrinsics) -> Finding | None:
 
 
 def _scatter(c: Intrinsics) -> Finding:
+    alike = c.scatter.correlated
     what = (
         f"The lens parameters scatter from photograph to photograph by {c.scatter.factor:.2f} times what the corners'"
         " noise explains"
+        + (f", of which common errors of neighbouring corners are {alike:.2f} times" if alike > 1 else "")
+        + f" (p = {c.scatter.p_value:.2g}){'; the sigmas include it.' if c.correlated_noise > 1 else '.'}"
     )
-    if c.correlated_noise == 1:
-        return passed(f"{what} (p = {c.scatter.p_value:.2g}).")
-    what += f" (p = {c.scatter.p_value:.1g}); the sigmas include it."
-    if c.scatter.p_value >= LIMITS.scatter_p_value:
+    if alike == 1 and (c.correlated_noise == 1 or c.scatter.p_value >= LIMITS.scatter_p_value):
         return passed(what)
     return finding("BP-L23", Level.WARN, what)
 

@@ -55,7 +55,9 @@ def test_views_have_the_density_that_the_others_predict():
     rng = np.random.default_rng(3)
     view = np.repeat(np.arange(5), 8)
     shared, own, residuals = (rng.normal(size=(40, 2, k)) for k in (3, 6, 1))
-    equations = ViewEquations.of_rows(shared, own, residuals[..., 0], view, np.arange(5), np.zeros((0, 3)), 3)
+    equations = ViewEquations.of_rows(
+        shared, own, residuals[..., 0], view, np.arange(5), np.zeros((0, 3)), 3, np.zeros((len(view), 1))
+    )
     change, _ = equations.solution()
     J, left = [], []  # of each view, in directions that its own unknowns do not reach
     for v in range(5):
@@ -147,6 +149,48 @@ def test_photographs_that_scatter_alike_in_every_direction_are_not_held_for_wors
         error, equations = drawn_apart(views, rng, (1.0, 1.0, 1.0))
         squares.append(error**2 / np.diagonal(equations.scattered_covariance(equations.scatter())))
     assert 0.85 < np.sqrt(np.mean(squares)) < 1.15
+
+
+def errors_by_alike_neighbours(views: int, share: float, rng: np.random.Generator) -> tuple[float, float]:
+    """The error of an unknown that bends 9 x 6 points of each photograph, in sigmas, and the stated factor.
+
+    Neighbours share the share of their squared error, over two spacings.
+    """
+    places = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+    K = (1 - share) * np.eye(54) + share * np.exp(-np.sum((places[:, None] - places) ** 2, axis=2) / 8)
+    x, y = (places / 4 - 1).T
+    zero = np.zeros(54)
+    own = np.stack(
+        [np.stack([f, zero], 1) for f in (zero + 1, x, y)] + [np.stack([zero, f], 1) for f in (zero + 1, x, y)], 2
+    )
+    rows, bends = [], [np.stack([x * x, x * y], 1), np.stack([x * y, y * y], 1), np.stack([x**3, y**3], 1)]
+    for _ in range(views):
+        turned = rng.normal(size=(3, 3))
+        rows.append(np.stack([sum(t * b for t, b in zip(by, bends, strict=True)) for by in turned], axis=2))
+    residuals = np.concatenate([np.linalg.cholesky(K) @ rng.normal(size=(54, 2)) for _ in range(views)])
+    every = np.arange(views)
+    at_truth = ViewEquations.of_rows(
+        np.concatenate(rows), np.tile(own, (views, 1, 1)), residuals, np.repeat(every, 54), every, np.zeros((0, 3)), 3,
+        np.tile(places, (views, 1)),
+    )  # fmt: skip
+    change, _ = at_truth.solution()
+    there = at_truth.moved(change)
+    spread = there.scatter()
+    return float(change[0] / np.sqrt(there.scattered_covariance(spread)[0, 0])), spread.correlated
+
+
+@pytest.mark.parametrize("views", further_slow([5, 12], fast=1))
+def test_corners_that_share_errors_with_their_neighbours_count_as_fewer(views):
+    """Without it 1.19 sigmas of five photographs, since few that happen to agree show no scatter."""
+    rng = np.random.default_rng(views)
+    found = np.array([errors_by_alike_neighbours(views, 0.7, rng) for _ in range(300)])
+    assert np.sqrt(np.mean(found[:, 0] ** 2)) == pytest.approx(1.0, abs=0.15)
+    assert np.median(found[:, 1]) > 1.5
+
+
+def test_independent_corners_are_taken_as_such():
+    rng = np.random.default_rng(3)
+    assert np.mean([errors_by_alike_neighbours(6, 0.0, rng)[1] == 1.0 for _ in range(100)]) > 0.98
 
 
 def test_noise_is_taken_for_scatter_less_often_the_more_photographs_there_are():

@@ -29,13 +29,15 @@ def discs(
     return rounded(light + np.random.default_rng(seed).normal(0, noise, x.shape))
 
 
-def textured(rng: np.random.Generator, centre: Sequence[float], radius: float, coarse_px: float) -> NDArray[np.uint8]:
+def textured(
+    rng: np.random.Generator, centre: Sequence[float], radius: float, coarse_px: float, contrast: float = BRIGHT - GREY
+) -> NDArray[np.uint8]:
     """A disc whose grey values are a smooth random field (sigma 22 DN), before an even grey; 2 x 2 samples a pixel."""
     n = 2
     v, u = (np.mgrid[: 120 * n, : 160 * n] + 0.5) / n - 0.5
     field = cv2.GaussianBlur(rng.normal(size=v.shape), (0, 0), n * coarse_px)
     inside = np.hypot(u - centre[0], v - centre[1]) < radius
-    light = np.where(inside, BRIGHT + 22.0 * field / field.std(), GREY).astype(np.float32)
+    light = np.where(inside, GREY + contrast + 22.0 * field / field.std(), GREY).astype(np.float32)
     light = cv2.GaussianBlur(cv2.resize(light, (160, 120), interpolation=cv2.INTER_AREA), (0, 0), 1.0)
     return rounded(light + rng.normal(0, 1.5, light.shape))
 
