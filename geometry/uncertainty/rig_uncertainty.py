@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, robust_sigma, symmetric
+from geometry.arrays import Array, Bools, Ints, robust_sigma, symmetric
 from geometry.camera import FISHEYE, Camera
 from geometry.forward_model import SpotDerivatives, SpotModel
 from geometry.pose import Pose
@@ -163,9 +163,8 @@ class Sensitivity:
         self.names = tuple(names)
         cameras, screens, beams = list(rig.cameras), list(rig.screens), list(rig.beams)
         camera_of = model.camera_of
-        # Per field of SpotDerivatives: indices of parameters, their columns in it, and the views (n, .) they act on.
-        self._actions: dict[str, tuple[list[int], list[int], Array]] = {}
-        masks: dict[str, list[Array]] = {}
+        # Per field of SpotDerivatives: views, columns in it, and indices of parameters (m,) that act on them.
+        self._actions: dict[str, Ints] = {}
         for i, name in enumerate(self.names):
             if not is_known(rig, name):
                 raise KeyError(name)
@@ -183,19 +182,15 @@ class Sensitivity:
                 field = "direction" if is_direction else "point"
                 column = (DIRECTION if is_direction else POINT).index(parameter)
                 views = model.beam_of == beams.index(item)
-            indices, columns, _ = self._actions.setdefault(field, ([], [], np.empty(0)))
-            indices.append(i)
-            columns.append(column)
-            masks.setdefault(field, []).append(views.astype(float))
-        for field, (indices, columns, _) in self._actions.items():
-            self._actions[field] = indices, columns, np.stack(masks[field], axis=-1)
+            own = np.array([(v, column, i) for v in np.flatnonzero(views)], dtype=np.int64).reshape(-1, 3).T
+            self._actions[field] = np.concatenate([self._actions.get(field, own[:, :0]), own], axis=1)
         self.of_lens = not {"pinhole", "distortion"}.isdisjoint(self._actions)  # of some camera's lens
 
     def of(self, derivatives: SpotDerivatives) -> Array:
         """d(pixels)/d(parameters) (..., n, 2, p), px per unit."""
         out = np.zeros((*derivatives.pixels.shape, len(self.names)))
-        for field, (indices, columns, views) in self._actions.items():
-            out[..., indices] = getattr(derivatives, field)[..., columns] * views[:, None, :]
+        for field, (view, column, parameter) in self._actions.items():
+            out[..., view, :, parameter] = getattr(derivatives, field)[..., view, :, column]
         return out
 
 
@@ -243,7 +238,7 @@ class RigUncertainty:
         """A (..., 2n, r) with A A^T the covariance: displacements by r independent errors of the rig, 1 sigma each."""
         derivatives = self._model.derivatives(world_from_body, self._sensitivity.of_lens)
         moves = self._sensitivity.of(derivatives)
-        moves = np.where(np.isnan(derivatives.pixels)[..., None], 0.0, moves)
+        moves[np.isnan(derivatives.pixels)] = 0.0
         *stack, n, two, p = moves.shape
         return np.asarray(moves.reshape(*stack, n * two, p) @ self._root)  # the stack may be empty
 
@@ -265,21 +260,18 @@ def covariance_root(covariance: Array) -> Array:
 NOISE_OF_ESTIMATE = 5 / 6
 
 
-def share_without_calibration(J: Array, noise: Array, calibration: Array) -> float:
-    """Share of an estimate's covariance that is left without the calibration's errors, which its weights include.
+def share_without_calibration(H: Array, noise: Array) -> Array:
+    """Share (k,) of estimates' covariances that is left without the calibration's errors, which their weights include.
 
     A smoother that weights m points with noise and calibration errors takes both for noise. The calibration's errors,
-    which no averaging reduces, are stated separately, so that they would count twice. J (m, 2, 6): Jacobians of the
-    points; noise, calibration (m, 2, 2), px^2: their covariances. 1 where the points do not determine the pose.
-    Source: ours.
+    which no averaging reduces, are stated separately, so that they would count twice. H (k, 6, 6): normal matrices with
+    the weights W of both; noise (k, 6, 6): the sums of J^T W N W J, N, px^2, the noise. 1 where the points do not
+    determine the pose. Source: ours.
     """
-    W = np.linalg.inv(noise + calibration)
-    JW = np.swapaxes(J, 1, 2) @ W  # (m, 6, 2)
-    H = np.sum(JW @ J, axis=0)
-    if not np.linalg.cond(H) < 1 / np.finfo(float).eps:
-        return 1.0
-    own = float(np.trace(np.linalg.solve(H, np.sum(JW @ noise @ np.swapaxes(JW, 1, 2), axis=0)))) / 6
-    return 1 - NOISE_OF_ESTIMATE * (1 - own)
+    determined = np.linalg.cond(H) < 1 / np.finfo(float).eps
+    both = np.linalg.solve(np.where(determined[:, None, None], H, np.eye(6)), noise)
+    own = np.where(determined, np.trace(both, axis1=1, axis2=2) / 6, 1.0)
+    return np.asarray(1 - NOISE_OF_ESTIMATE * (1 - own))
 
 
 _OUTLIER2 = 4.5**2  # squared distance, in sigmas, beyond which a difference does not count as scatter

@@ -11,12 +11,15 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints
 from geometry.compiled_projection import Views, project_all
 from geometry.pose import Pose
-from geometry.pose_solver.gauss_newton import coordinates_of, covariance_of
+from geometry.pose_solver.gauss_newton import covariances_of
 from geometry.uncertainty.rig_uncertainty import share_without_calibration
+from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.smoothing.motion.process_noise import corner_offsets
-from tracking.smoothing.motion.run_detections import Reference, RunDetections, labelled_points
+from tracking.smoothing.motion.run_detections import Reference, RunDetections
 from tracking.smoothing.recording import TrackedRecording
 
+_FEWEST_SPOTS = 3  # of a frame's pose
+_TOGETHER = 256  # frames whose covariances of all pixels are moved at once
 _SHORT = 0.1  # of the step between two frames: within a shorter exposure accelerations move nothing
 
 
@@ -88,57 +91,39 @@ def calibration_errors(
     """
     n, frames = len(rec.model), len(rec)
     calibration_cov = np.zeros((n, 2, 2))
-    if rec.calibration is None:
+    use = (assigned >= 0) & (assigned < BLENDED)
+    at = np.flatnonzero(rec.measured & (use.sum(axis=1) >= _FEWEST_SPOTS))
+    if rec.calibration is None or not len(at):
         return calibration_cov, np.zeros((1, 6, 6)), np.ones(frames)
-    pixel_cov: list[Array | None] = [None] * frames
-    for block in np.array_split(np.flatnonzero(rec.measured), frames // 256 + 1):
-        for k, C in zip(block.tolist(), rec.calibration.at(Pose(ref.R[block], ref.t[block])), strict=True):
-            pixel_cov[k] = C
-    J = project_all(rec.model.numbers, ref.R, ref.t)[1]
-    gains = _gains(rec, detections, assigned, J, calibration_cov)
-    total, count = np.zeros((n, 2, 2)), 0
-    for k, (gain, C) in enumerate(zip(gains, pixel_cov, strict=True)):
-        if gain is not None and C is not None:
-            rows, G = gain
-            residual = np.eye(2 * n)
-            residual[:, coordinates_of(rows)] -= J[k].reshape(2 * n, 6) @ G
-            joint = (residual @ C @ residual.T).reshape(n, 2, n, 2)
-            total += joint[np.arange(n), :, np.arange(n)]
-            count += 1
-    calibration_cov = total / max(count, 1)
-    weighted = _gains(rec, detections, assigned, J, calibration_cov)
+    use, noise = use[at], np.zeros((len(at), n, 2, 2))
+    noise[use] = detections.cov[(detections.begin[at][:, None] + assigned[at])[use]]
+    J = project_all(rec.model.numbers, ref.R[at], ref.t[at])[1]
+    gains, has_pose, _ = _gains(J, use, noise, noise)
+    at, use = at[has_pose], use[has_pose]
+    noise, J, gains = noise[has_pose], J[has_pose], gains[has_pose]
+    pixel_cov = np.empty((len(at), 2 * n, 2 * n))
+    for some in np.array_split(np.arange(len(at)), len(at) // _TOGETHER + 1):
+        pixel_cov[some] = C = rec.calibration.at(Pose(ref.R[at[some]], ref.t[at[some]]))
+        left = (np.eye(2 * n) - J[some].reshape(-1, 2 * n, 6) @ gains[some]).reshape(-1, n, 2, 2 * n)
+        calibration_cov += np.sum((left @ C[:, None]) @ np.swapaxes(left, -1, -2), axis=0) / max(len(at), 1)
+    weighted, has_pose, share_left = _gains(J, use, noise, noise + calibration_cov)
+    gains[has_pose] = weighted[has_pose]
     systematic, share = np.zeros((frames, 6, 6)), np.ones(frames)
-    latest = np.zeros((6, 6))
-    for k, C in enumerate(pixel_cov):
-        gain = gains[k] if weighted[k] is None else weighted[k]
-        if gain is not None and C is not None:
-            rows, G = gain
-            both = coordinates_of(rows)
-            before, latest = latest, G @ C[np.ix_(both, both)] @ G.T
-            if not before.any():  # the frames before this one have poses only of the smoothing pass
-                systematic[:k] = latest
-            _, _, cov = labelled_points(detections, k, assigned[k], np.zeros_like(calibration_cov))
-            share[k] = share_without_calibration(J[k][rows], cov[rows], calibration_cov[rows])
-        systematic[k] = latest
+    if len(at):
+        latest = np.maximum(np.searchsorted(at, np.arange(frames), side="right") - 1, 0)
+        systematic, share[at] = (gains @ pixel_cov @ np.swapaxes(gains, 1, 2))[latest], share_left
     return calibration_cov, systematic, share
 
 
-def _gains(
-    rec: TrackedRecording, detections: RunDetections, assigned: Ints, J: Array, calibration_cov: Array
-) -> list[tuple[Ints, Array] | None]:
-    """By frame: the views (m,) used in the pose, and the pose's derivative (6, 2 m) by their pixels; None: no pose.
+def _gains(J: Array, use: Bools, noise: Array, cov: Array) -> tuple[Array, Bools, Array]:
+    """The poses' derivatives (K, 6, 2 n) by the pixels of K frames' used views (K, n), with weights of `cov`.
 
-    J (T, n, 2, 6): Jacobians; the weights are those of noise plus calibration_cov (n, 2, 2).
+    J (K, n, 2, 6): Jacobians; noise, cov (K, n, 2, 2). Second: which frames have a pose (K,). Third: the share (K,) of
+    an optimal motion's covariance that is left without what `cov` has beyond the noise.
     """
-    out: list[tuple[Ints, Array] | None] = [None] * len(rec)
-    for k in np.flatnonzero(rec.measured).tolist():
-        use, _, cov = labelled_points(detections, k, assigned[k], np.zeros_like(calibration_cov))
-        rows = np.flatnonzero(use)
-        if len(rows) < 3:
-            continue
-        J_k, W = J[k][rows], np.linalg.inv(cov[rows] + calibration_cov[rows])
-        JW = np.swapaxes(J_k, 1, 2) @ W  # (m, 6, 2)
-        covariance, full_rank = covariance_of(np.sum(JW @ J_k, axis=0))
-        if full_rank:
-            out[k] = rows, covariance @ np.concatenate(list(JW), axis=1)
-    return out
+    W = np.where(use[..., None, None], np.linalg.inv(np.where(use[..., None, None], cov, np.eye(2))), 0.0)
+    JW = np.swapaxes(J, -1, -2) @ W  # (K, n, 6, 2)
+    H = np.sum(JW @ J, axis=1)
+    covariance, full_rank = covariances_of(H)
+    gains = np.where(full_rank[:, None, None], covariance, 0.0) @ np.concatenate(list(np.moveaxis(JW, 1, 0)), axis=-1)
+    return gains, full_rank, share_without_calibration(H, np.sum(JW @ noise @ np.swapaxes(JW, -1, -2), axis=1))

@@ -12,8 +12,9 @@ import pytest
 from calibration.lens.fit.corner_table import CornerTable
 from calibration.lens.fit.lens_models import LENS_MODELS, LensModel, named
 from calibration.lens.intrinsics import Intrinsics, IntrinsicsError, IntrinsicsOptions, calibrate_intrinsics
+from calibration.terms.rig_blocks import INTRINSICS
 from geometry.camera import FISHEYE
-from lab.calibrate.camera.camera_page import findings_of
+from lab.calibrate.camera.camera_page import LIMITS, findings_of
 from lab.findings.finding import Level, verdict
 from tests.calibration.lens.lens_scenes import SIZE, TRUTH, WIDE, Scene, board_points, photographs
 from tests.marks import further_slow
@@ -171,6 +172,51 @@ def test_noisy_corners_fail():
     noisy = replace(c, fit=replace(c.fit, sigma_px=1.5))
     (level,) = (f.level for f in findings_of(noisy) if f.what.startswith("Corner residuals: 1.5 px"))
     assert level is Level.FAIL
+
+
+def of_lens(c: Intrinsics, i: int, value: float, variance: float = 0.0) -> Intrinsics:
+    """A calibration with another number of its lens."""
+    step, covariance = np.zeros((1, len(c.fit.lens))), c.covariance.copy()
+    step[0, i], covariance[i], covariance[:, i], covariance[i, i] = value - c.fit.lens[i], 0.0, 0.0, variance
+    values = {**c.fit.values, INTRINSICS: c.fit.values[INTRINSICS].plus(step)}
+    return replace(c, fit=replace(c.fit, values=values), covariance=covariance)
+
+
+def with_aspect(c: Intrinsics, away: float, sigma: float = 0.0) -> Intrinsics:
+    """A calibration with another fx / fy, known to this sigma."""
+    fy = c.fit.lens[1]
+    return of_lens(of_lens(c, 1, fy), 0, fy * (1 + away), (sigma * fy * (1 + away)) ** 2)
+
+
+NUMBERS = {
+    "Corner residuals": (LIMITS.noise_px, lambda c, x: replace(c, fit=replace(c.fit, sigma_px=x))),
+    "orientations": (LIMITS.spread_deg, lambda c, x: replace(c, coverage=replace(c.coverage, spread_deg=x))),
+    "Boards covered": (LIMITS.filled, lambda c, x: replace(c, coverage=replace(c.coverage, filled=x, gaps=()))),
+    "Focal length": (LIMITS.focal, lambda c, x: of_lens(c, 0, c.fit.lens[0], (x * c.fit.lens[0]) ** 2)),
+    "fx / fy": (LIMITS.aspect, with_aspect),
+    "Principal point": (
+        LIMITS.off_centre,
+        lambda c, x: of_lens(of_lens(c, 2, (SIZE[0] - 1) / 2 + x * SIZE[0]), 3, (SIZE[1] - 1) / 2),
+    ),
+    "Hold-out": (LIMITS.overfit, lambda c, x: replace(c, held_out_rms_px=x * c.fit.sigma_px)),
+}
+
+
+@pytest.mark.parametrize("words", NUMBERS)
+def test_each_number_of_a_lens_is_a_warning_beyond_its_first_limit_and_a_failure_beyond_the_second(words):
+    (first, second), with_number = NUMBERS[words]
+    worse = (second / first) ** 0.01  # by so much of the way, in either direction
+    values = first / worse, first * worse, second / worse, second * worse
+    levels = [finding(with_number(typical(), value), words) for value in values]
+    assert levels == [Level.PASS, Level.WARN, Level.WARN, Level.FAIL]
+
+
+def test_pixels_that_are_not_square_are_no_warning_where_the_photographs_do_not_show_it():
+    first, second = LIMITS.aspect
+    some, much = 2 * first, 2 * second
+    assert finding(with_aspect(typical(), some, 0.45 * some), "fx / fy") is Level.WARN
+    assert finding(with_aspect(typical(), some, 0.55 * some), "fx / fy") is Level.PASS
+    assert finding(with_aspect(typical(), much, much), "fx / fy") is Level.FAIL
 
 
 @pytest.mark.parametrize("lean", [pytest.param((0.0, 0.0), marks=pytest.mark.slow), (0.5, 0.2)])

@@ -311,6 +311,18 @@ def test_the_volume_of_the_visible_poses_agrees_with_a_count():
     assert model.in_picture(model.project(visible.typical)[0]).all()
 
 
+def test_further_cameras_at_the_same_places_show_no_further_poses():
+    """Neither of both screens, nor of one of them, whose spots are then seen twice."""
+    rig = RIGS["four-skew-beams"]()
+    everywhere, first = PosePrior.everywhere(rig), next(iter(rig.cameras))
+    volumes = []
+    for again in ((), (first,), tuple(rig.cameras)):
+        cameras = {**rig.cameras, **{f"{n} 2": replace(rig.cameras[n], name=f"{n} 2") for n in again}}
+        several = replace(rig, cameras=cameras)
+        volumes.append(VisiblePoses.of(several, SpotModel.of(several), everywhere, 4).log_volume)
+    assert volumes == pytest.approx(volumes[:1] * 3, abs=1.2)  # samples scatter by .4; views not counted: 2 and more
+
+
 @pytest.mark.parametrize("name", ["unequal-fan", "four-skew-beams"])
 def test_any_four_spots_contain_triples_and_larger_sets_are_covered_first(name):
     rig = RIGS[name]()
