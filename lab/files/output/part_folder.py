@@ -101,11 +101,11 @@ def replace_folder(work: Path, target: Path) -> None:
         try:
             target.rename(old)
             work.rename(target)
-        except BaseException:  # also a signal
-            if old.exists() and not target.exists():
-                old.rename(target)
+            old.rename(work)  # now it is no longer what `recover` looks for
+        except BaseException:  # also a signal, between any two of them
+            if old.exists():
+                old.rename(work if target.exists() else target)
             raise
-        old.rename(work)  # now it is no longer what `recover` looks for
 
 
 def _to_disk(folder: Path) -> None:

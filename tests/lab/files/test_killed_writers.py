@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from lab.errors import InputError
+from lab.files.output import part_folder
 from lab.files.text.atomic_write import atomic_folder
 from tests.paths import ROOT
 
@@ -138,6 +139,25 @@ def test_the_folder_of_a_living_process_is_kept_and_that_of_a_dead_one_removed(t
     assert len(names(tmp_path)) == 3  # results, part folder and lock
     start_and_fail(target)
     assert names(tmp_path) == ["results"]
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_a_signal_between_any_two_renames_leaves_one_complete_folder(tmp_path, monkeypatch, which):
+    target, rename, count = tmp_path / "results", Path.rename, iter(range(10))
+    target.mkdir()
+    (target / "a.csv").write_text("old")
+
+    def renamed_and_stopped(self, to):
+        rename(self, to)
+        if next(count) == which:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(part_folder, "exchange", lambda one, other: False)
+    monkeypatch.setattr(Path, "rename", renamed_and_stopped)
+    with pytest.raises(KeyboardInterrupt), atomic_folder(target, lambda _: True) as work:
+        (work / "a.csv").write_text("new")
+    assert names(tmp_path) == ["results"]
+    assert (target / "a.csv").read_text() == ("old" if which == 0 else "new")
 
 
 def test_a_process_killed_between_two_renames_loses_nothing(tmp_path):
