@@ -23,7 +23,7 @@ from lab.findings.finding import Level, Outcome, Verdict, worst_first
 from lab.findings.finding import verdict as verdict_of
 from lab.packages import versions
 from lab.progress import Progress
-from lab.runs.frames.pipeline import FrameRecord, Pair, Pipeline, row_records
+from lab.runs.frames.pipeline import Pair, Pipeline, row_records
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.processed import Processed
 from lab.runs.run_log import listening
@@ -236,39 +236,30 @@ def write_results(
 
 
 def write_tables(
-    passes: TrackingAndSmoothing,
-    work: Path,
-    *,
-    causal: bool = False,
-    on_frame: Callable[[FrameRecord, FrameRecord | None], None] | None = None,
+    passes: TrackingAndSmoothing, work: Path, *, causal: bool = False
 ) -> tuple[RunStatistics, ModelCheck, Verdict]:
     """Track a run, write its tables into `work`, and compute the verdict.
 
     Where a camera was moved during a recording, its pictures from then on are left out, and the tables are written
-    again. on_frame: called with each frame as it is written and, unless `causal`, the same frame of the causal pass.
+    again.
     """
-    from lab.runs.model_check.check import check_sampled_frames  # deferred: only needed at the end of a run
-
     run = passes.pipeline.run
-    statistics, sampler, pictures = _written(passes, work, causal, on_frame)
-    model_check = check_sampled_frames(run.rig, sampler, run.covariance)
-    moved = _movement(run, statistics, model_check)
+    written = _written(passes, work, causal)
+    moved = _movement(run, written[0], written[1])
     if moved is not None and moved.camera and not any(isinstance(s, LiveDevice) for s in run.cameras.values()):
         passes.leave_out(moved.camera, moved.frame)
-        statistics, sampler, pictures = _written(passes, work, causal, on_frame)
-        model_check = check_sampled_frames(run.rig, sampler, run.covariance)
+        written = _written(passes, work, causal)
         moved = dataclasses.replace(moved, left_out=True)
-    statistics.moved = moved
-    return statistics, *_judged(passes, statistics, model_check, sampler, pictures)
+    written[0].moved = moved
+    return written[0], *_judged(passes, *written)
 
 
 def _written(
-    passes: TrackingAndSmoothing,
-    work: Path,
-    causal: bool,
-    on_frame: Callable[[FrameRecord, FrameRecord | None], None] | None,
-) -> tuple[RunStatistics, FrameSampler, SampledFrames]:
+    passes: TrackingAndSmoothing, work: Path, causal: bool
+) -> tuple[RunStatistics, ModelCheck, FrameSampler, SampledFrames]:
     """The tables of a run, and what the verdict needs of its frames. Arguments as of `write_tables`."""
+    from lab.runs.model_check.check import check_sampled_frames  # deferred: only needed at the end of a run
+
     run = passes.pipeline.run
     model = SpotModel.of(run.rig)
     checks = FrameChecks(run.rig, run.covariance)
@@ -297,9 +288,7 @@ def _written(
             tables.write(record, in_causal_pass)
             statistics.add(record, in_causal_pass)
             pictures.add(record.frame, dict(zip(run.rig.cameras, record.detections, strict=True)))
-            if on_frame is not None:
-                on_frame(record, in_causal_pass)
-    return statistics, sampler, pictures
+    return statistics, check_sampled_frames(run.rig, sampler, run.covariance), sampler, pictures
 
 
 def _movement(run: Run, statistics: RunStatistics, model_check: ModelCheck) -> MovedCamera | None:

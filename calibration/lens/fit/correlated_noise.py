@@ -34,19 +34,19 @@ def correlations(residuals: Sequence[Array], poses: Sequence[Array], places: Seq
     measured, independent, pairs = np.zeros(bins), np.zeros(bins), np.zeros(bins)
     expected = np.zeros((len(_LENGTHS), bins))
     for r, Q, d2 in zip(residuals, poses, apart2, strict=True):
-        r, Q = r.reshape(-1, 2), Q.reshape(-1, 2, 6)
-        fields = [np.exp(-d2 / (2 * length**2)) for length in _LENGTHS]
+        r, of_corner = r.reshape(-1, 2), Q.reshape(len(d2), -1)  # (n, 2), (n, 12)
+        fields = np.array([np.exp(-d2 / (2 * length**2)).ravel() for length in _LENGTHS])
         for b in range(bins):
             near = (d2 <= _LAGS[b] ** 2) & (d2 > _LAGS[b - 1] ** 2) if b else d2 == 0
             W = near.astype(float)
-            moved = np.einsum("ij,jck->ick", W, Q)
-            half = np.einsum("ick,kl->icl", Q, 0.5 * np.einsum("ick,icl->kl", Q, moved)) - moved
-            taken = np.einsum("ick,jck->ij", half, Q)  # W less what the poses take up of it, u and v together
-            left = 2 * W + taken + taken.T
+            moved = (W @ of_corner).reshape(Q.shape)
+            half = Q @ (0.5 * Q.T @ moved) - moved
+            taken = half.reshape(of_corner.shape) @ of_corner.T
+            left = 2 * W + taken + taken.T  # W less what the poses take up of it, u and v together
             measured[b] += np.sum(r * (W @ r))
             independent[b] += np.trace(left)
             pairs[b] += W.sum()
-            expected[:, b] += [np.sum(left * field) for field in fields]
+            expected[:, b] += fields @ left.ravel()
     if measured[1] - independent[1] * measured[0] / max(independent[0], 1e-300) < _SIGNIFICANT * 2 * np.sqrt(pairs[1]):
         return None
     model = (1 - _SHARES[:, None]) * independent + _SHARES[:, None] * expected[:, None]  # (lengths, shares, bins)

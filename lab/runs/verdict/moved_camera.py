@@ -16,6 +16,7 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from tracking.detections import Detections
+from tracking.parameters import TrackerParameters
 from tracking.statuses import SpotStatus, TrackedFrame
 
 FEWEST_FRAMES = 5  # before the movement and after it
@@ -23,7 +24,7 @@ _ASTRAY = 0.2  # share of the expected spots that are shown elsewhere, which is 
 _BEFORE, _AFTER = 0.05, 0.25  # largest share of them before the movement, least share after it
 _FEWEST_ASTRAY = 8.0  # spots
 _USED = 0.1  # share of the expected spots that the poses after the movement still use, from which on they are wrong
-_MERGED_PX = 3.0  # between spots, as TrackerParameters.blend_px
+_MERGED_PX = TrackerParameters().blend_px  # between spots
 _OFF = 2.0  # how many times farther than usual, and than those of the other cameras, its points are off the predictions
 _LEAST_OFF_PX = 0.1  # what counts as usual at least
 _FAR_OFF = 5.0  # the same in other frames than that of the first sign
