@@ -23,7 +23,7 @@ from lab.findings.finding import Level, Outcome, Verdict, worst_first
 from lab.findings.finding import verdict as verdict_of
 from lab.packages import versions
 from lab.progress import Progress
-from lab.runs.frames.pipeline import Pair, Pipeline, row_records
+from lab.runs.frames.pipeline import FrameRecord, Pair, Pipeline, row_records
 from lab.runs.model_check.frame_sampler import FrameSampler
 from lab.runs.processed import Processed
 from lab.runs.run_log import listening
@@ -236,26 +236,34 @@ def write_results(
 
 
 def write_tables(
-    passes: TrackingAndSmoothing, work: Path, *, causal: bool = False
+    passes: TrackingAndSmoothing,
+    work: Path,
+    *,
+    causal: bool = False,
+    on_frame: Callable[[FrameRecord, FrameRecord | None], None] | None = None,
 ) -> tuple[RunStatistics, ModelCheck, Verdict]:
     """Track a run, write its tables into `work`, and compute the verdict.
 
     Where a camera was moved during a recording, its pictures from then on are left out, and the tables are written
-    again.
+    again. on_frame: called with each frame as it is written and, unless `causal`, the same frame of the causal pass
+    (the benches compare both with the truth).
     """
     run = passes.pipeline.run
-    written = _written(passes, work, causal)
+    written = _written(passes, work, causal, on_frame)
     moved = _movement(run, written[0], written[1])
     if moved is not None and moved.camera and not any(isinstance(s, LiveDevice) for s in run.cameras.values()):
         passes.leave_out(moved.camera, moved.frame)
-        written = _written(passes, work, causal)
+        written = _written(passes, work, causal, on_frame)
         moved = dataclasses.replace(moved, left_out=True)
     written[0].moved = moved
     return written[0], *_judged(passes, *written)
 
 
 def _written(
-    passes: TrackingAndSmoothing, work: Path, causal: bool
+    passes: TrackingAndSmoothing,
+    work: Path,
+    causal: bool,
+    on_frame: Callable[[FrameRecord, FrameRecord | None], None] | None,
 ) -> tuple[RunStatistics, ModelCheck, FrameSampler, SampledFrames]:
     """The tables of a run, and what the verdict needs of its frames. Arguments as of `write_tables`."""
     from lab.runs.model_check.check import check_sampled_frames  # deferred: only needed at the end of a run
@@ -288,6 +296,8 @@ def _written(
             tables.write(record, in_causal_pass)
             statistics.add(record, in_causal_pass)
             pictures.add(record.frame, dict(zip(run.rig.cameras, record.detections, strict=True)))
+            if on_frame is not None:
+                on_frame(record, in_causal_pass)
     return statistics, check_sampled_frames(run.rig, sampler, run.covariance), sampler, pictures
 
 
