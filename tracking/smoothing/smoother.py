@@ -30,6 +30,7 @@ from tracking.smoothing.error_scale import ErrorScale, usual_sizes, well_known
 from tracking.smoothing.labels.continuity import continued, transfers_between_cameras
 from tracking.smoothing.labels.neighbouring_frames import (
     connected,
+    contradicted_gaps,
     displaced,
     isolated,
     labelled_once,
@@ -369,6 +370,10 @@ class _Smoother:
         motion, causal, assigned = self.motion, self.causal, self.assigned
         self.own = replace(self.own, measured=self.own.measured & self.trusted)
         final, pose_P, motion_P = self._with_own_poses()
+        uv, cov = project_with_covariances(self.views, final.R, final.t, pose_P)
+        expected, measured = (uv, cov + self.calibration_cov), self.own.measured & motion.known
+        lost = contradicted_gaps(self.detections, assigned, self.view_table.camera, expected, measured)
+        known = motion.known & ~lost
         differ = (assigned % BLENDED != causal % BLENDED) & ~((assigned < 0) & (causal < 0))
         place_share, place_factor, covariance = self._place_errors(final, pose_P)
         # Measured is the mean over the exposure; reported is the pose at its middle.
@@ -417,8 +422,8 @@ class _Smoother:
             rest_parts=np.column_stack(rest),
             systematic=self.systematic,
             motion_covariance=motion_P,
-            known=motion.known,
-            measured=self.own.measured & motion.known,
+            known=known,
+            measured=measured,
             assigned=assigned,
             probability=self.probability,
             first=self.detections.first,

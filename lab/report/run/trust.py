@@ -16,6 +16,7 @@ from lab.report.plot import svg
 from lab.report.run.report_data import ReportData
 from lab.report.run.tables import label_counts
 from lab.report.summary import day_of, findings_in, mappings
+from lab.runs.verdict.quality import GOOD_MEASURED
 from tracking.statuses import PoseStatus
 
 HEADS = (
@@ -195,7 +196,7 @@ def _poses(m: ReportData) -> Evidence | None:
     first, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
     gap = format_count(stop - first, "frame")
     words = f"measured in {format_percent(float(measured.mean()))} of the frames; longest gap {gap}"
-    level = Level.FAIL if not measured.any() else Level.WARN if measured.mean() < _SURE else Level.PASS
+    level = Level.FAIL if not measured.any() else Level.WARN if measured.mean() < GOOD_MEASURED else Level.PASS
     return Evidence(level, "Poses", words, time_link(m, first, stop - 1), f"frame {m.poses.frames[first]}")
 
 

@@ -105,6 +105,7 @@ class Timings:
     smoothing: float = 0.0
 
 
+LEFT_OUT = "left out: the camera has moved"  # reason for a picture that is not used
 NEGLIGIBLE_S = 1e-9  # between a picture and its moment: rounding of times
 
 
@@ -199,7 +200,7 @@ class Pipeline:
         for name in self.run.rig.cameras:
             picture = frames.images[name]
             if self.moved is not None and name == self.moved[0] and frames.frame >= self.moved[1]:
-                picture = MissingPicture("left out: the camera has moved")
+                picture = MissingPicture(LEFT_OUT)
             if isinstance(picture, np.ndarray):
                 picture = self.spots_in(name, picture)
             if self.found is not None and frames.moment is not None and name in frames.moment.pictures:

@@ -81,9 +81,11 @@ def judge(
     for name in (name for name, own in noise.items() if own.interlaced):
         what = f"even and odd rows of the pictures of camera {name} show the moving spots at two places: interlaced"
         found.append(finding("BP-V23", Level.WARN, what, numbers={"camera": name}))
-    found += _measured(statistics)
     if statistics.measured:
-        found += _cameras(statistics) + _numbering(statistics)
+        found += _movement(statistics) + _measured(statistics) + _cameras(statistics) + _numbering(statistics)
+        found += _never_on_screen(statistics)
+    else:
+        found += _measured(statistics)
     if noise_scale is not None:
         found += _noise_scale(noise_scale)
     found += [f for f in given if f.code != _SET_UP]
@@ -197,6 +199,7 @@ def _measured(statistics: RunStatistics) -> list[Finding]:
         what = "the vehicle was never found: no frame has a measured pose"
         return [
             finding("BP-V02", Level.FAIL, what, numbers=numbers),
+            *_movement(statistics),
             *_cameras(statistics),
             *_why_never(statistics),
         ]
@@ -264,32 +267,43 @@ def _why_never(statistics: RunStatistics) -> list[Finding]:
     return []
 
 
-def _cameras(statistics: RunStatistics) -> list[Finding]:
-    """Cameras without pictures, without points of light in them, or that have moved."""
-    out, movement = [], statistics.moved
+def _movement(statistics: RunStatistics) -> list[Finding]:
+    """Cameras that have moved during the recording: the reason for what the other findings on them say."""
+    movement = statistics.moved
     if movement is not None and not movement.left_out:
         what = (
             f"from frame {movement.frame} on, spots are not where the poses put them, and the pictures show as many"
             " points elsewhere: a camera, a screen or a laser has moved, or these poses are wrong"
         )
-        out.append(finding("BP-V19", Level.FAIL, what, numbers={"frame": movement.frame, "camera": movement.camera}))
+        numbers: dict[str, Any] = {"frame": movement.frame, "camera": movement.camera}
+        return [finding("BP-V19", Level.FAIL, what, numbers=numbers)]
+    out = []
     for name, camera in statistics.cameras.items():
-        numbers = {"camera": name, **camera.as_mapping()}
-        if movement is not None and movement.left_out and movement.camera == name:
+        if movement is not None and movement.camera == name:
             what = (
                 f"camera {name} or its screen has moved during the recording, before frame {movement.frame}: its"
                 " pictures from that frame on are not used"
             )
-            out.append(finding("BP-V19", Level.WARN, what, numbers=numbers))
-        else:
-            out += _pictures(name, camera, statistics)
-        if movement is None and len(moved := camera.moved) >= LEAST_DISPLACED:
+        elif movement is None and len(moved := camera.moved) >= LEAST_DISPLACED:
             where = f"{format_count(len(moved), 'frame')} ({moved.as_text()})"
             what = (
                 f"camera {name}: in {where} its spots are not where the poses put them: the camera or its screen has"
                 " moved during the recording"
             )
-            out.append(finding("BP-V19", Level.WARN, what, numbers=numbers))
+        else:
+            continue
+        out.append(finding("BP-V19", Level.WARN, what, numbers={"camera": name, **camera.as_mapping()}))
+    return out
+
+
+def _cameras(statistics: RunStatistics) -> list[Finding]:
+    """Cameras without pictures, or without points of light in them."""
+    out: list[Finding] = []
+    left_out = statistics.moved.camera if statistics.moved is not None and statistics.moved.left_out else ""
+    for name, camera in statistics.cameras.items():
+        numbers = {"camera": name, **camera.as_mapping()}
+        if name != left_out:
+            out += _pictures(name, camera, statistics)
         if not camera.pictures:
             continue
         empty = camera.empty / camera.pictures
@@ -325,6 +339,19 @@ def _numbering(statistics: RunStatistics) -> list[Finding]:
             numbers = {"cameras": [a, b], "frames": shift}
             out.append(finding("BP-V05", Level.WARN, what, variant="numbers", numbers=numbers))
     return out
+
+
+def _never_on_screen(statistics: RunStatistics) -> list[Finding]:
+    """Spots whose beams miss their screens in all frames with a pose."""
+    status: dict[str, set[str]] = {}
+    for (_, spot), counts in statistics.spot_status.items():
+        status.setdefault(spot, set()).update(word for word, count in counts.items() if count)
+    never = [spot for spot, words in status.items() if words - {SpotStatus.LOST.value} == {SpotStatus.OFF_SCREEN.value}]
+    if not never:
+        return []
+    which = f"spot {never[0]} hits its" if len(never) == 1 else f"spots {', '.join(never)} hit their"
+    what = f"{which} screen in no frame: the rig is wrong in this, or the spot is none of this recording"
+    return [finding("BP-V24", Level.WARN, what, numbers={"spots": never})]
 
 
 def _pictures(name: str, camera: CameraStatistics, statistics: RunStatistics) -> list[Finding]:

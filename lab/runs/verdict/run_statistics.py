@@ -21,7 +21,7 @@ from geometry.rig import Rig
 from geometry.uncertainty.rig_uncertainty import RigCovariance, RigUncertainty
 from lab.files.run.results import ListedEvent
 from lab.number_format import format_count
-from lab.runs.frames.pipeline import FrameRecord, Pair
+from lab.runs.frames.pipeline import LEFT_OUT, FrameRecord, Pair
 from lab.runs.verdict.moved_camera import MovedCamera, ShownSpots
 from tracking.consistency import SpotAgreement, against_causal, against_own_spots, contradictory, is_covariance
 from tracking.detections import UNMATCHED
@@ -251,6 +251,7 @@ class FrameCause(Word):
     """Why a frame has no measured pose: the first that applies. Meaning: text that follows a number of such frames."""
 
     NO_PICTURE = "no_picture", "without a picture of some camera"
+    LEFT_OUT = "left_out", "without the pictures of a camera that has moved"
     CONTRADICTION = "contradiction", "whose pose contradicts its spots or the causal pass"
     UNEXPLAINED = "unexplained", "with enough points of light, which no pose explains"
     LABELS_OPEN = "labels_open", "with spots whose labels are uncertain"
@@ -419,7 +420,9 @@ class RunStatistics:
                 camera.empty_at_end += 1
             if record.tracked.pose is not None:
                 measured = record.tracked.pose_status is PoseStatus.MEASURED
-                if camera.spots.add(record.frame, record.tracked, views, found) and measured:
+                # Where no camera shows a spot, the pose is a prediction alone, and points elsewhere say nothing.
+                shown = any(s.measured for s in status)
+                if shown and camera.spots.add(record.frame, record.tracked, views, found) and measured:
                     camera.displaced.add(record.frame)
                 own = [status[v] for v in views]
                 camera.found += sum(s.measured for s in own)
@@ -432,7 +435,7 @@ class RunStatistics:
     def _cause(self, record: FrameRecord) -> FrameCause:
         tracked = record.tracked
         if any(found is None for found in record.detections):
-            return FrameCause.NO_PICTURE
+            return FrameCause.LEFT_OUT if LEFT_OUT in record.missing else FrameCause.NO_PICTURE
         if any(event.kind == CONTRADICTION for event in tracked.events):
             return FrameCause.CONTRADICTION
         given = np.array([s.measured for s in tracked.status])
@@ -461,7 +464,8 @@ class RunStatistics:
                 break
         out: Counter[FrameCause] = Counter()
         for (cause, surplus), frames in self._causes.items():
-            shows_more = cause not in (FrameCause.NO_PICTURE, *MISSED) and surplus >= usual + self.min_spots
+            given = cause in (FrameCause.NO_PICTURE, FrameCause.LEFT_OUT, *MISSED)
+            shows_more = not given and surplus >= usual + self.min_spots
             out[FrameCause.UNEXPLAINED if shows_more else cause] += frames
         return dict(out.most_common())
 

@@ -784,9 +784,42 @@ def test_poses_after_a_knock_of_one_of_two_cameras_do_not_use_its_pictures(shift
     assert [
         level for level, what in named if "before frame 45: its pictures from that frame on are not used" in what
     ] == ["WARN"]
+    # The movement is the reason for frames without a pose: it comes first, and nobody has to look for lost pictures.
+    assert outcome.verdict.findings[0].code == "BP-V19"
+    assert not any("dropped" in f.remedy for f in outcome.verdict.findings)
     truth = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["errors"]["pose"]["measured"]
     assert truth["rows"] >= 45
     assert truth["beyond_10_sigmas"] == 0
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_a_vehicle_that_turns_away_faster_than_ever_before_has_no_predicted_poses(shown, tmp_path):
+    """Two frames show its spots far from the prediction, then none do: the sigmas of a calm motion do not hold."""
+    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=90, detections_only=True)
+    points = pd.read_csv(run_folder / "detections.csv")
+    for camera, axis in (("left", "u_px"), ("right", "v_px")):
+        for turned, frame in enumerate((40, 41), start=1):
+            points.loc[(points.camera == camera) & (points.frame == frame), axis] += 70.0 * turned**2
+    points = points[~points.frame.between(42 if shown else 40, 60)]
+    points.to_csv(run_folder / "detections.csv", index=False)
+    process_run(run_folder, tmp_path / "out")
+    status = pd.read_csv(tmp_path / "out" / "attitude.csv")["status"].to_numpy()
+    assert set(status[40:61]) == {"lost" if shown else "predicted"}
+    assert set(np.delete(status, slice(40, 61))) == {"measured"}
+
+
+def test_a_spot_that_never_hits_its_screen_is_a_point_to_check(tmp_path):
+    """`beampose check` names it; the run was a PASS."""
+    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=40, detections_only=True)
+    assert process_run(run_folder, tmp_path / "before").verdict.status == "pass"
+    rig = yaml.safe_load((run_folder / "rig.yaml").read_text("utf-8"))
+    beam, of = next(iter(rig["target"]["beams"].values())), next(iter(rig["target"]["spots"].values()))
+    rig["target"]["beams"]["away"] = {**beam, "direction": [-x for x in beam["direction"]]}
+    rig["target"]["spots"]["beyond"] = {**of, "beam": "away"}
+    (run_folder / "rig.yaml").write_text(yaml.safe_dump(rig), "utf-8")
+    found = process_run(run_folder, tmp_path / "out").verdict.findings
+    assert [(f.code, f.level.name) for f in found] == [("BP-V24", "WARN")]
+    assert "spot beyond hits its screen in no frame" in found[0].what
 
 
 def test_the_point_of_two_spots_that_have_merged_does_not_shift_the_poses(tmp_path):

@@ -150,3 +150,12 @@ def test_frames_in_which_no_spot_of_a_camera_fits_the_pose_are_those_of_a_displa
     assert cameras["left"].displaced.ranges == [[1, 2]]
     assert cameras["right"].displaced.ranges == []
     assert cameras["left"].as_mapping()["displaced"] == [[1, 2]]
+
+
+def test_points_elsewhere_than_a_mere_prediction_has_the_spots_do_not_show_that_a_camera_has_moved():
+    """A vehicle that comes back after a gap is somewhere near the prediction; its camera has stood still."""
+    seen = [a_record(k) for k in range(20)]
+    elsewhere = [a_record(k, PREDICTED, (SEEN,) * 3 + (HIDDEN,) * 3) for k in range(20, 40)]
+    assert statistics_of(*seen, *elsewhere).cameras["right"].spots.moved_from() == 20
+    predicted = [a_record(k, PREDICTED, (HIDDEN,) * N) for k in range(20, 40)]
+    assert statistics_of(*seen, *predicted).cameras["right"].spots.moved_from() == -1

@@ -11,7 +11,7 @@ from geometry.arrays import Array
 from tests.marks import further_slow
 from tests.tracking.smoothing.test_fixed_interval import Run, drawn
 from tracking.smoothing.motion.fixed_interval import smoothed
-from tracking.smoothing.motion.process_noise import LOG_RANGE, next_log_density
+from tracking.smoothing.motion.process_noise import LOG_RANGE, largest_jumps, next_log_density
 from tracking.smoothing.motion.whole_run import GLOBAL_PASSES
 
 FRAMES = 300
@@ -116,3 +116,15 @@ def test_covariances_are_right_where_one_axis_moves_less_than_the_noise(amplitud
         out = smoothed(run.ref, run.info, np.exp(log_density), True)
         squares.append((run.true[:, 3] + sine - out.x[:, 3]) ** 2 / out.pose_P[:, 3, 3])
     assert 0.6 < np.mean(squares) < largest
+
+
+def test_in_a_gap_the_velocities_may_jump_as_far_as_at_either_of_its_ends():
+    """Spots that are seen to turn away at one end come back as fast; the other end is calm."""
+    run = drawn(1, FRAMES)
+    velocities = np.zeros_like(run.ref.m)
+    velocities[95:100, 3] = 7.0
+    measured = (np.arange(FRAMES) < 100) | (np.arange(FRAMES) >= 250)
+    variance = largest_jumps(run.ref._replace(m=velocities), measured, run.info.dt)
+    assert np.all(variance[100:251] == variance[100:251].max(axis=0))
+    assert np.all(variance[100:251, 1] >= 7.0**2)
+    assert np.all(variance[260:, 1] < 1.0)

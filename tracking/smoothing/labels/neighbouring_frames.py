@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, Ints
+from geometry.arrays import Array, Bools, Ints, true_ranges
 from tracking.rigid_body.association.frame_detections import BLENDED
-from tracking.rigid_body.hypotheses.hypothesis_set import MIN_CONFIRMING_SPOTS
+from tracking.rigid_body.hypotheses.hypothesis_set import MIN_CONFIRMING_SPOTS, MIN_REDUNDANT_SPOTS
 from tracking.smoothing.motion.run_detections import RunDetections
 
 
@@ -64,6 +64,38 @@ def isolated(count: Ints) -> Bools:
     before, after = np.concatenate([[-1], count[:-1]]), np.concatenate([count[1:], [-1]])
     supported = ((before > 0) & (before < count + 2)) | ((after > 0) & (after < count + 2))
     return (count > 0) & (count < MIN_CONFIRMING_SPOTS) & ((before == 0) | (after == 0)) & ~supported
+
+
+EDGE_FRAMES = 5  # at both ends of a gap: later the spots of a vehicle that has turned away are outside the pictures
+USUAL_POINTS = 0.95  # quantile, over measured frames, of the unlabelled points of a picture that count as usual
+NEAR_CHI2 = 25.0  # of 2 degrees of freedom: a point nearer to the place of a spot may be that spot
+
+
+def contradicted_gaps(
+    detections: RunDetections, assigned: Ints, camera: Ints, expected: tuple[Array, Array], measured: Bools
+) -> Bools:
+    """(T,): frames of gaps in the measured ones (T,) at whose ends spots are shown elsewhere than the motion puts them.
+
+    Then the vehicle has not moved as in the other frames, and its motion in the gap is not known. camera (n,): of each
+    view. expected: pixels (T, n, 2) at the motion, nan where there are none, and their covariances (T, n, 2, 2).
+    Source: ours.
+    """
+    out, points = np.zeros_like(measured), np.diff(detections.first, axis=1)
+    labels = np.stack([(assigned[:, camera == c] >= 0).sum(axis=1) for c in range(points.shape[1])], axis=1)
+    shown = [(points - labels)[measured & there, c] for c, there in enumerate(detections.has_image.T)]
+    usual = [float(np.quantile(free, USUAL_POINTS)) if len(free) else 0.0 for free in shown]
+    for first, end in true_ranges(~measured):
+        ends = {*range(first, min(first + EDGE_FRAMES, end)), *range(max(end - EDGE_FRAMES, first), end)}
+        astray = 0.0
+        for k in (k for k in ends if not labels[k].any()):
+            for c, most in enumerate(usual):
+                rows = detections.begin[k] + np.arange(detections.first[k, c], detections.first[k, c + 1])
+                uv, cov = (a[k, camera == c] for a in expected)
+                d, spread = detections.uv[rows, None] - uv, cov + detections.cov[rows, None]
+                near = np.einsum("pvi,pvij,pvj->pv", d, np.linalg.inv(spread), d) < NEAR_CHI2
+                astray += max(float(np.count_nonzero(~near.any(axis=1))) - most, 0.0)
+        out[first:end] = astray >= MIN_REDUNDANT_SPOTS
+    return out
 
 
 # Labels of a camera whose spots are all displaced by the same shift from where the other cameras put them.

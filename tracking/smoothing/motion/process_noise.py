@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from geometry.arrays import Array, Bools, weighted_median
+from geometry.arrays import Array, Bools, true_ranges, weighted_median
 from geometry.pose import Pose
 from tracking.rigid_body.models.motion import ANY_MOMENT, process_noise
 from tracking.rigid_body.online_estimates import jump_variance
@@ -150,10 +150,16 @@ def unobserved_steps(measured: Bools) -> Bools:
 
 
 def largest_jumps(ref: Reference, measured: Bools, dt: Array) -> Array:
-    """Variances (T, 2) of jumps as large as the fastest motion near each step, (m/s)^2 and (rad/s)^2."""
+    """Variances (T, 2) of jumps as large as the fastest motion near each step, (m/s)^2 and (rad/s)^2.
+
+    In a gap: near the whole of it. What a vehicle did at one end of it it may have done at the other, and in between.
+    """
     usual = float(np.median(dt[dt > 0])) if np.any(dt > 0) else SPEED_WINDOW_S
     window = max(1, min(round(SPEED_WINDOW_S / usual), len(dt)))
-    return jump_variance(largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window))
+    fastest = largest_near(np.where(measured[:, None], speeds(ref.m), 0.0), window)
+    for first, end in true_ranges(unobserved_steps(measured)):
+        fastest[first:end] = fastest[first:end].max(axis=0)
+    return jump_variance(fastest)
 
 
 def jump_variances(ref: Reference, weak: Bools, measured: Bools, jumped: Bools, dt: Array) -> Array:
