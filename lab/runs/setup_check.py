@@ -222,7 +222,7 @@ def unused_cameras(statistics: RunStatistics) -> list[str]:
 
 def has_doubtful_pictures(statistics: RunStatistics) -> bool:
     """Whether a camera has pictures in which none of its spots is found where the poses put it."""
-    return any(c.unlabelled + len(c.displaced) >= DOUBTFUL for c in statistics.cameras.values())
+    return any(c.unlabelled + len(c.moved) >= DOUBTFUL for c in statistics.cameras.values())
 
 
 def hidden_by_symmetry(run: Run, statistics: RunStatistics, sampler: FrameSampler) -> tuple[Finding, ...]:

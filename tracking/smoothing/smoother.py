@@ -7,8 +7,7 @@
    poses belong together.
 4. Compare each pose with that of the frame's own spots. Where they contradict each other a velocity jump is assumed and
    the motion estimated again; if the contradiction remains, the frame's own spots decide.
-5. Add labels by continuity where the pose is uncertain (labels/continuity.py), and those of a camera that was knocked
-   (labels/neighbouring_frames.py).
+5. Add labels by continuity where the pose is uncertain (labels/continuity.py).
 
 lab/runs/verdict/run_statistics.py tests the result once more, against the spots and the causal pose. Source: ours.
 """
@@ -31,7 +30,6 @@ from tracking.smoothing.labels.continuity import continued, transfers_between_ca
 from tracking.smoothing.labels.neighbouring_frames import (
     connected,
     contradicted_gaps,
-    displaced,
     isolated,
     labelled_once,
     merged_with_hidden,
@@ -347,7 +345,7 @@ class _Smoother:
         )
 
     def continue_paths(self) -> None:
-        """Label spots by the continuity of their paths where the pose is uncertain, and those of a displaced camera."""
+        """Label spots by the continuity of their paths where the pose is uncertain."""
         motion = self.motion
         uv, cov = project_with_covariances(self.views, motion.ref.R, motion.ref.t, motion.pose_P)
         cov += self.calibration_cov
@@ -359,10 +357,6 @@ class _Smoother:
         context = PathContext(self.view_table.camera, uv, cov, log_clutter, log_static, ~known | ~sure | vague)
         transfers = transfers_between_cameras(self.rec.rig, self.model.views)
         self.assigned, probability = continued(self.detections, self.assigned, context, transfers)
-        visible = self.model.in_picture(uv) & sure & ~vague
-        with_displaced = displaced(self.detections, self.assigned, self.view_table.camera, uv, visible)
-        probability[with_displaced != self.assigned] = SURE_PROBABILITY
-        self.assigned = with_displaced
         self.probability = np.where(np.isnan(probability), self.probability, probability)
 
     def result(self, rounds: int) -> Smoothed:

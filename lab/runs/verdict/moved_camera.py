@@ -16,7 +16,6 @@ import numpy as np
 
 from geometry.arrays import Array, Ints
 from tracking.detections import Detections
-from tracking.parameters import TrackerParameters
 from tracking.statuses import SpotStatus, TrackedFrame
 
 FEWEST_FRAMES = 5  # before the movement and after it
@@ -24,7 +23,6 @@ _ASTRAY = 0.2  # share of the expected spots that are shown elsewhere, which is 
 _BEFORE, _AFTER = 0.05, 0.25  # largest share of them before the movement, least share after it
 _FEWEST_ASTRAY = 8.0  # spots
 _USED = 0.1  # share of the expected spots that the poses after the movement still use, from which on they are wrong
-_MERGED_PX = TrackerParameters().blend_px  # between spots
 _OFF = 2.0  # how many times farther than usual, and than those of the other cameras, its points are off the predictions
 _LEAST_OFF_PX = 0.1  # what counts as usual at least
 _FAR_OFF = 5.0  # the same in other frames than that of the first sign
@@ -41,20 +39,21 @@ class ShownSpots:
     points: array[float] = field(default_factory=lambda: array("f"))  # detected
     off_px: array[float] = field(default_factory=lambda: array("f"))  # see `off_prediction_px`
 
-    def add(self, frame: int, tracked: TrackedFrame, views: Sequence[int], found: Detections) -> bool:
-        """Add the next frame: the camera's views, and the points in its picture.
+    def add(self, frame: int, tracked: TrackedFrame, views: Sequence[int], found: Detections) -> None:
+        """Add the next frame: the camera's views, and the points in its picture. Spots that have merged do not count.
 
-        Returns whether spots have labels and none of them fits the pose. Spots that have merged do not count.
+        Of these one has the label of a point that is not used, and the other one is hidden.
         """
-        own = sorted(set(views) - merged_spots(tracked, views))
-        measured = [v for v in own if tracked.status[v].measured]
-        used = measured if tracked.used_in_pose is None else [v for v in measured if tracked.used_in_pose[v]]
+        used = np.array([tracked.status[v].measured for v in views], dtype=bool)
+        hidden = sum(tracked.status[v] is SpotStatus.OCCLUDED for v in views)
+        if tracked.used_in_pose is not None:
+            merged = used & ~tracked.used_in_pose[list(views)]
+            used, hidden = used & ~merged, max(hidden - int(merged.sum()), 0)
         self.frames.append(frame)
-        self.expected.append(len(measured) + sum(tracked.status[v] is SpotStatus.OCCLUDED for v in own))
-        self.used.append(len(used))
+        self.expected.append(int(used.sum()) + hidden)
+        self.used.append(int(used.sum()))
         self.points.append(len(found))
         self.off_px.append(off_prediction_px(tracked.predicted_px[list(views)], found.uv_px))
-        return bool(measured) and not used
 
     def astray(self) -> Array:
         """(T,): spots that are not found where the pose puts them and are shown elsewhere.
@@ -99,16 +98,6 @@ class ShownSpots:
         if len(before) < FEWEST_FRAMES or len(now) < 2 or self.frames[k] != frame:
             return 0.0
         return float(np.nan_to_num(now.min()) / max(float(np.median(before)), _LEAST_OFF_PX))
-
-
-def merged_spots(tracked: TrackedFrame, views: Sequence[int]) -> set[int]:
-    """Those of a camera's views whose point is the light of two spots, and those that are not found beside them."""
-    if tracked.used_in_pose is None:
-        return set()
-    points = [v for v in views if tracked.status[v].measured and not tracked.used_in_pose[v]]
-    hidden = [v for v in views if tracked.status[v] is SpotStatus.OCCLUDED]
-    uv = tracked.uv_px
-    return {v for p in points for h in hidden if np.linalg.norm(uv[p] - uv[h]) < _MERGED_PX for v in (p, h)}
 
 
 def off_prediction_px(predicted_px: Array, uv_px: Array) -> float:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from lab.findings.finding import Finding, Level, Verdict, finding, level_above, sentence, verdict, worst_first
 from lab.number_format import format_count, format_with_sigma
 from lab.runs.verdict.run_statistics import (
-    LEAST_DISPLACED,
     MISSED,
     CameraStatistics,
     FrameCause,
@@ -284,7 +283,7 @@ def _movement(statistics: RunStatistics) -> list[Finding]:
                 f"camera {name} or its screen has moved during the recording, before frame {movement.frame}: its"
                 " pictures from that frame on are not used"
             )
-        elif movement is None and len(moved := camera.moved) >= LEAST_DISPLACED:
+        elif movement is None and len(moved := camera.moved):
             where = f"{format_count(len(moved), 'frame')} ({moved.as_text()})"
             what = (
                 f"camera {name}: in {where} its spots are not where the poses put them: the camera or its screen has"

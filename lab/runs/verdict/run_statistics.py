@@ -243,7 +243,6 @@ MOST_EVENTS = 500  # listed one by one; of the others the number is reported
 # Events that may continue in the next frame: listed once, with their last frame.
 LASTING = ("undecided", "changed", CONTRADICTION, "not_a_covariance")
 _USUAL_CLUTTER = 0.95  # quantile, over the measured frames, of the unlabelled points that count as usual clutter
-LEAST_DISPLACED = 5  # frames in which none of a camera's spots fits the others' pose, from which on it is reported
 _MOST_POINTS = 50  # larger numbers of unlabelled points are counted as this number
 
 
@@ -281,8 +280,6 @@ class CameraStatistics:
     expected_at_end: int = 0  # spots that the pose puts inside those
     missing: FrameRanges = field(default_factory=FrameRanges)  # frames without a usable picture
     missing_reasons: Counter[str] = field(default_factory=Counter)
-    # Measured frames in which this camera's spots have labels and none of them fits the pose of the other cameras.
-    displaced: FrameRanges = field(default_factory=FrameRanges)
     spots: ShownSpots = field(default_factory=ShownSpots)
 
     @property
@@ -291,7 +288,7 @@ class CameraStatistics:
         astray = FrameRanges()
         for frame in self.spots.frames_astray().tolist():
             astray.add(frame)
-        return astray if len(astray) >= LEAST_DISPLACED > len(self.displaced) else self.displaced
+        return astray
 
     def as_mapping(self) -> dict[str, Any]:
         """For summary.json."""
@@ -419,11 +416,9 @@ class RunStatistics:
             else:
                 camera.empty_at_end += 1
             if record.tracked.pose is not None:
-                measured = record.tracked.pose_status is PoseStatus.MEASURED
                 # Where no camera shows a spot, the pose is a prediction alone, and points elsewhere say nothing.
-                shown = any(s.measured for s in status)
-                if shown and camera.spots.add(record.frame, record.tracked, views, found) and measured:
-                    camera.displaced.add(record.frame)
+                if any(s.measured for s in status):
+                    camera.spots.add(record.frame, record.tracked, views, found)
                 own = [status[v] for v in views]
                 camera.found += sum(s.measured for s in own)
                 expected = sum(s.measured or s is SpotStatus.OCCLUDED for s in own)

@@ -8,8 +8,8 @@ import pytest
 
 from lab.findings.finding import Finding, Level, Verdict, entries, finding
 from lab.runs.frames.sensor_noise import CameraNoise
-from lab.runs.verdict.moved_camera import MovedCamera
-from lab.runs.verdict.quality import GOOD_MEASURED, LEAST_DISPLACED, LEAST_MEASURED, LEAST_MEASURED_OF_SHOWN, judge
+from lab.runs.verdict.moved_camera import FEWEST_FRAMES, MovedCamera, ShownSpots
+from lab.runs.verdict.quality import GOOD_MEASURED, LEAST_MEASURED, LEAST_MEASURED_OF_SHOWN, judge
 from lab.runs.verdict.run_statistics import MISSED, CameraStatistics, FrameCause, FrameRanges, RunStatistics
 
 FRAMES = 1000
@@ -290,9 +290,15 @@ def test_raw_pictures_of_a_colour_camera_are_a_point_to_check():
     assert verdict.exit_status == 0
 
 
-@pytest.mark.parametrize(("frames", "status"), [(LEAST_DISPLACED - 1, "pass"), (LEAST_DISPLACED, "check")])
+@pytest.mark.parametrize(("frames", "status"), [(FEWEST_FRAMES - 1, "pass"), (FEWEST_FRAMES, "check")])
 def test_a_camera_that_moved_during_the_recording_is_a_point_to_check(frames, status):
-    cameras = {"left": a_camera(displaced=ranges((500, 499 + frames))), "right": a_camera()}
+    spots = ShownSpots()
+    for frame in range(500 + frames):
+        spots.frames.append(frame)
+        spots.expected.append(3)
+        spots.used.append(3 if frame < 500 else 0)
+        spots.points.append(3)
+    cameras = {"left": a_camera(spots=spots), "right": a_camera()}
     verdict = judge(statistics_of(cameras=cameras))
     assert verdict.status == status
     if status == "check":

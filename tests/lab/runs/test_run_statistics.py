@@ -141,15 +141,26 @@ def test_frame_ranges_count_their_frames_and_list_the_first_ranges():
     assert ranges.as_text(9) == "3 to 5, 9, 11 to 12, 20, 30"
 
 
-def test_frames_in_which_no_spot_of_a_camera_fits_the_pose_are_those_of_a_displaced_camera():
-    used = np.array([False] * 3 + [True] * 3)
-    records = [a_record(k) for k in range(4)]
-    for k in (1, 2):
-        records[k] = replace(records[k], tracked=replace(records[k].tracked, used_in_pose=used))
-    cameras = statistics_of(*records).cameras
-    assert cameras["left"].displaced.ranges == [[1, 2]]
-    assert cameras["right"].displaced.ranges == []
-    assert cameras["left"].as_mapping()["displaced"] == [[1, 2]]
+def test_frames_in_which_a_camera_shows_its_spots_elsewhere_are_those_of_a_displaced_camera():
+    hidden = (HIDDEN,) * 3 + (SEEN,) * 3
+    cameras = statistics_of(*(a_record(k, status=hidden if k > 9 else (SEEN,) * N) for k in range(20))).cameras
+    assert cameras["left"].moved.ranges == [[10, 19]]
+    assert cameras["right"].moved.ranges == []
+    assert cameras["left"].as_mapping()["displaced"] == [[10, 19]]
+
+
+@pytest.mark.parametrize("merged", [1, 2])
+def test_spots_that_have_merged_do_not_show_that_a_camera_has_moved(merged):
+    """One of two has the label of their point, which is not used; the other one is hidden. A knock hides all."""
+    status, used = [SEEN] * N, np.ones(N, dtype=bool)
+    status[1], used[0] = HIDDEN, False
+    if merged == 1:
+        status[2] = HIDDEN
+    records = [a_record(k) for k in range(40)]
+    for k in range(20, 40):
+        tracked = replace(records[k].tracked, status=tuple(status), used_in_pose=used)
+        records[k] = replace(records[k], tracked=tracked)
+    assert statistics_of(*records).cameras["left"].spots.moved_from() == (20 if merged == 1 else -1)
 
 
 def test_points_elsewhere_than_a_mere_prediction_has_the_spots_do_not_show_that_a_camera_has_moved():

@@ -1,9 +1,8 @@
-"""Labels judged by their neighbours: isolated ones, those of merged spots, and those of a camera that was knocked."""
+"""Labels judged by their neighbours: isolated ones, those of merged spots, and those at the ends of gaps."""
 
 from __future__ import annotations
 
-from itertools import pairwise, permutations
-from typing import NamedTuple
+from itertools import permutations
 
 import numpy as np
 
@@ -96,95 +95,3 @@ def contradicted_gaps(
                 astray += max(float(np.count_nonzero(~near.any(axis=1))) - most, 0.0)
         out[first:end] = astray >= MIN_REDUNDANT_SPOTS
     return out
-
-
-# Labels of a camera whose spots are all displaced by the same shift from where the other cameras put them.
-#
-# A camera that was knocked during the recording shows its spots a pixel or more beside the expected places. Each of
-# them alone is far outside its gate and could be a false point, but false points do not form the same figure, frame
-# after frame. These labels do not contribute to the pose. Source: ours.
-
-MAX_SHIFT_PX = 20.0  # of the figure; a camera that has turned farther needs a new calibration to be recognised
-# Difference between the shifts of two spots, and of two frames: a turn about the optical axis and distortion.
-TOLERANCE_PX, TOLERANCE_SHARE = 0.3, 0.1
-MIN_FRAMES = 5  # in a row
-# A single point beside the place of a spot may be another light. One that keeps its shift while the spot moves is not.
-MIN_SINGLE_FRAMES, MAX_SINGLE_SHIFT_PX, MIN_SINGLE_PATH_PX = 10, 5.0, 10.0
-
-
-def displaced(detections: RunDetections, assigned: Ints, camera: Ints, expected_px: Array, visible: Bools) -> Ints:
-    """Assignments (T, n) with the labels of displaced cameras, plus BLENDED.
-
-    camera (n,): of each view. expected_px (T, n, 2): pixels at poses that other cameras measure. visible (T, n):
-    whether the spot should be in the picture.
-    """
-    out = assigned.copy()
-    for c in np.unique(camera):
-        own = np.flatnonzero(camera == c)
-        found: dict[int, _Figure] = {}
-        free = visible[:, own].any(axis=1) & (assigned[:, own] < 0).all(axis=1) & detections.has_image[:, c]
-        for k in np.flatnonzero(free).tolist():
-            views = own[visible[k, own]]
-            begin, rows = detections.begin[k], np.arange(detections.first[k, c], detections.first[k, c + 1])
-            figure = _figure(detections.uv[begin + rows], expected_px[k, views])
-            if figure is not None:
-                found[k] = _Figure(views, rows[figure[0]], figure[1], expected_px[k, views[0]])
-        for frames in _rows_of_frames(found):
-            for k in frames:
-                out[k, found[k].views] = found[k].rows + BLENDED
-    return out
-
-
-class _Figure(NamedTuple):
-    """Points of one frame in one camera that form the figure of the expected places."""
-
-    views: Ints  # (v,)
-    rows: Ints  # (v,) of the points
-    shift: Array  # (2,) px
-    place: Array  # (2,) px, expected, of the first view
-
-
-def _tolerance(shift: Array) -> float:
-    return TOLERANCE_PX + TOLERANCE_SHARE * float(np.linalg.norm(shift))
-
-
-def _figure(points: Array, expected: Array) -> tuple[Ints, Array] | None:
-    """The points (v,) that form the figure of the v expected places, and its shift (2,), px; None without a clear one.
-
-    points (m, 2) and expected (v, 2), px.
-    """
-    if len(points) < len(expected):
-        return None
-    fits: list[tuple[Ints, Array]] = []
-    for shift in points - expected[0]:
-        if np.linalg.norm(shift) > MAX_SHIFT_PX:
-            continue
-        off = np.linalg.norm(points - (expected + shift)[:, None], axis=-1)
-        nearest = off.argmin(axis=1)
-        if off.min(axis=1).max() < _tolerance(shift) and len(np.unique(nearest)) == len(nearest):
-            fits.append((nearest, np.asarray((points[nearest] - expected).mean(axis=0))))
-    return fits[0] if len(fits) == 1 else None
-
-
-def _rows_of_frames(found: dict[int, _Figure]) -> list[list[int]]:
-    """Consecutive frames with about the same shift, if there are enough in a row."""
-    frames = sorted(found)
-    rows = [frames[:1]]
-    for before, k in pairwise(frames):
-        step = found[k].shift - found[before].shift
-        if k == before + 1 and np.linalg.norm(step) < _tolerance(found[k].shift):
-            rows[-1].append(k)
-        else:
-            rows.append([k])
-    return [r for r in rows if _is_clear([found[k] for k in r])]
-
-
-def _is_clear(row: list[_Figure]) -> bool:
-    """Whether the figures of consecutive frames are those of a displaced camera."""
-    if len(row) < MIN_FRAMES:
-        return False
-    if max(len(f.views) for f in row) > 1:
-        return True
-    path = np.ptp([f.place for f in row], axis=0).max()
-    near = max(float(np.linalg.norm(f.shift)) for f in row) < MAX_SINGLE_SHIFT_PX
-    return bool(near and len(row) >= MIN_SINGLE_FRAMES and path > MIN_SINGLE_PATH_PX)
