@@ -135,8 +135,10 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     common = 0.0
     if good.any() and half_px == _PASSES[-1][0]:  # the passes before need no such precision
         height = np.sqrt(2 * np.pi) * sigma * strength
-        tail = 0.5 * upper_median(height[good]) * (1 - erf(float(offset[-1]) / (np.sqrt(2) * sigma)))
-        ends = polarity * values[:, [0, -1]] + [-tail, tail]  # without what the blurred step still rises there
+        own = np.sqrt(sigma**2 - _STEP_PX**2 / 3)  # without the difference that gave the slopes
+        tails = [erf((float(offset[-1]) + s) / (np.sqrt(2) * own)) - 1 for s in (-shift, shift)]
+        # Without what the blurred step still rises there.
+        ends = polarity * values[:, [0, -1]] + 0.5 * upper_median(height[good]) * np.array(tails) * [1.0, -1.0]
         away, inner = _beside(crop, rim, theta, polarity, ends, strength)
         radius -= sigma**2 * away / height
         common = abs(sigma**2 * inner / upper_median(height[good]))
@@ -152,10 +154,11 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
 def _beside(
     crop: SmoothCrop, rim: Rim, theta: Array, polarity: int, ends_dn: Array, slope: Array
 ) -> tuple[Array, float]:
-    """Slope outside the rays less that inside (n,), DN/px, each as a difference to its mean; and the mean one inside.
+    """Slope outside the rays less that inside (n,), DN/px, the latter as a difference to its mean; and that mean.
 
     A step of height A between slopes a and b, blurred by sigma, is steepest at (b - a) sigma^2 / A from the step:
-    before clouds that moves a side of the rim. Source: ours; the derivative of the blurred profile is zero there.
+    before clouds that moves a side of the rim, or all of it. Inside, a mean slope may also be another edge of the
+    target. Source: ours; the derivative of the blurred profile is zero there.
     ends_dn: (n, 2) grey values at the rays' inner and outer end, half a step beyond the last pass's half width.
     slope: (n,) DN/px, of the edges; nan without one.
     """
@@ -170,7 +173,7 @@ def _beside(
     wide = 2 * round(_ALONG_PX * len(theta) / (4 * np.pi * max(rim.radius_px, 1.0))) + 1
     means = np.mean(slopes[good], axis=0)
     edge = np.abs(slopes - means) > _ANOTHER_PART * steep
-    mean = _along_rim(np.concatenate([slopes - means, edge], axis=1), wide)
+    mean = _along_rim(np.concatenate([slopes - means * [1.0, 0.0], edge], axis=1), wide)
     away = np.where(mean[:, 2:] > 0, 0.0, mean[:, :2])
     # A Wiener filter: what is mostly noise is left out. The median of a squared normal error is .455 of its variance.
     noise = 0.455 * 2 * (crop.noise_dn / length) ** 2 * min(CORRELATED_PX / _ALONG_PX, 1.0)
