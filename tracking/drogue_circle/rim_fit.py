@@ -135,8 +135,14 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
     common = 0.0
     if good.any() and half_px == _PASSES[-1][0]:  # the passes before need no such precision
         height = np.sqrt(2 * np.pi) * sigma * strength
-        tail = 0.5 * upper_median(height[good]) * (1 - erf(float(offset[-1]) / (np.sqrt(2) * sigma)))
-        ends = polarity * values[:, [0, -1]] + [-tail, tail]  # without what the blurred step still rises there
+        half, width = float(offset[-1]), np.sqrt(sigma**2 - _STEP_PX**2 / 3)  # without the difference of the slopes
+        step = upper_median(height[good])
+        tail = 0.5 * step * (1 - erf(half / (np.sqrt(2) * width)))
+        density = step / (np.sqrt(2 * np.pi) * width) * np.exp(-0.5 * (half / width) ** 2)
+        # Without what the blurred step still rises at the ends, of an edge that is not in the middle between them.
+        moved = np.where(good, radius - shift - base, 0.0)[:, None]
+        rises = density * moved * (1 + np.array([-0.5, 0.5]) * moved * half / width**2)
+        ends = polarity * values[:, [0, -1]] + [-tail, tail] + rises
         away, inner = _beside(crop, rim, theta, polarity, ends, strength)
         radius -= sigma**2 * away / height
         common = abs(sigma**2 * inner / upper_median(height[good]))
@@ -152,10 +158,11 @@ def rim_points(crop: SmoothCrop, rim: Rim, half_px: float, polarity: int, hidden
 def _beside(
     crop: SmoothCrop, rim: Rim, theta: Array, polarity: int, ends_dn: Array, slope: Array
 ) -> tuple[Array, float]:
-    """Slope outside the rays less that inside (n,), DN/px, each as a difference to its mean; and the mean one inside.
+    """Slope outside the rays less that inside (n,), DN/px, the latter as a difference to its mean; and that mean.
 
     A step of height A between slopes a and b, blurred by sigma, is steepest at (b - a) sigma^2 / A from the step:
-    before clouds that moves a side of the rim. Source: ours; the derivative of the blurred profile is zero there.
+    before clouds that moves a side of the rim, or all of it. Inside, a mean slope may also be another edge of the
+    target. Source: ours; the derivative of the blurred profile is zero there.
     ends_dn: (n, 2) grey values at the rays' inner and outer end, half a step beyond the last pass's half width.
     slope: (n,) DN/px, of the edges; nan without one.
     """
@@ -170,7 +177,7 @@ def _beside(
     wide = 2 * round(_ALONG_PX * len(theta) / (4 * np.pi * max(rim.radius_px, 1.0))) + 1
     means = np.mean(slopes[good], axis=0)
     edge = np.abs(slopes - means) > _ANOTHER_PART * steep
-    mean = _along_rim(np.concatenate([slopes - means, edge], axis=1), wide)
+    mean = _along_rim(np.concatenate([slopes - means * [1.0, 0.0], edge], axis=1), wide)
     away = np.where(mean[:, 2:] > 0, 0.0, mean[:, :2])
     # A Wiener filter: what is mostly noise is left out. The median of a squared normal error is .455 of its variance.
     noise = 0.455 * 2 * (crop.noise_dn / length) ** 2 * min(CORRELATED_PX / _ALONG_PX, 1.0)
@@ -214,7 +221,7 @@ _LEAST_DETERMINANT = 1e-6  # of the normalised normal matrix: see `_solved`
 _ON_RIM_PX = 0.5  # least distance from the rim at which an edge counts as on it
 SECTORS = 32  # parts of a rim whose visibility is stated
 _GAP_SIGMAS, _END_SIGMAS = 1.0, 3.5  # half length of a gap of the rim, and of its ends, in sigmas of the blurred edge
-_FAR_PX = 0.7  # a last pass that moves the rim by more is repeated
+_FAR_PX = 0.15  # a last pass that moves the rim by more is repeated: edges depend on where their rays begin and end
 _ENOUGH_PX = 0.3  # a pass that moves the rim by less is not repeated
 _PASSES = ((4.0, 2.0), (2.5, 1.0), (2.0, 0.0))  # half width of the rays and least scale of the residuals, px
 
@@ -270,7 +277,7 @@ def fit_rim(
             break
     points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
     circle = _solve(points, 0.0, oblique=False)
-    if circle is not None and np.hypot(circle[0].u_px - rim.u_px, circle[0].v_px - rim.v_px) > _FAR_PX:
+    if circle is not None and np.abs(np.subtract(astuple(circle[0])[:3], astuple(rim)[:3])).max() > _FAR_PX:
         rim = circle[0]
         points = rim_points(crop, rim, _PASSES[-1][0], coarse.polarity, hidden)
         circle = _solve(points, 0.0, oblique=False)
