@@ -38,22 +38,27 @@ _OFTEN, _FEWEST = 0.08, 2  # share and number of the lights that consist of seve
 def shows_grains(pictures: Sequence[Picture], found: Sequence[Detections], model: NoiseModel, clips_dn: float) -> bool:
     """Whether spots of these pictures (h, w) of a camera are grainy, or several of the points found in each of them.
 
-    Then they are measured better in sums of SIDE x SIDE pixels. clips_dn: grey value at which the sensor clips.
+    Then they are measured better in sums of SIDE x SIDE pixels. Not in front of objects, which are grainy, too: there
+    those that move in front of a background show it. clips_dn: grey value at which the sensor clips.
     """
-    left_over = [_left_over(points, model) for points in found]
-    counted = _counted(found, left_over, model)
-    every = np.concatenate([x[c] for x, c in zip(left_over, counted, strict=True)])
-    wide = np.concatenate([_width(points)[c] > _WIDTH for points, c in zip(found, counted, strict=True)])
-    if not len(every) or np.median(every) < _EVEN:
+    if is_limited_by_texture(model):
         return False
-    if np.count_nonzero(wide) >= _FEWEST_LIGHTS and np.median(every[wide]) > _GRAINY:
+    counted = _counted(found, model)
+    if grainy(counted, model):
         return True
+    if not any(map(len, counted)) or np.median(np.concatenate([_left_over(c, model) for c in counted])) < _EVEN:
+        return False
     usual = replace(DetectParameters(), saturation_dn=clips_dn)
-    lights = [_in_sums(picture, usual, model) for picture in pictures]
-    counted = _counted(lights, [_left_over(points, model) for points in lights], model)
-    parts = [_parts(some[c], points) for some, c, points in zip(lights, counted, found, strict=True)]
-    several = np.concatenate(parts) > 1
+    lights = _counted([_in_sums(picture, usual, model) for picture in pictures], model)
+    several = np.concatenate([_parts(some, points) for some, points in zip(lights, found, strict=True)]) > 1
     return bool(np.count_nonzero(several) >= _FEWEST and several.mean() > _OFTEN)
+
+
+def grainy(found: Sequence[Detections], model: NoiseModel) -> bool:
+    """Whether lights that move are wide enough to be measured in sums of pixels, and most of them are grainy."""
+    wide = [_clear(points, model) for points in found]
+    left_over = np.concatenate([_left_over(points[_width(points) > _WIDTH], model) for points in wide])
+    return len(left_over) >= _FEWEST_LIGHTS and bool(np.median(left_over) > _GRAINY)
 
 
 def _in_sums(picture: Picture, parameters: DetectParameters, model: NoiseModel) -> Detections:
@@ -74,15 +79,17 @@ def _left_over(points: Detections, model: NoiseModel) -> Array:
     return np.sqrt(np.maximum(points.unexplained**2 - noise, 0.0))
 
 
-def _counted(found: Sequence[Detections], left_over: Sequence[Array], model: NoiseModel) -> list[Bools]:
-    """(n,) of each picture: clear lights that may be spots.
-
-    Those that move, since objects at rest are grainy, too; where nothing moves and the background is even, all.
-    """
+def _clear(points: Detections, model: NoiseModel) -> Detections:
+    """The points that are clear, and no objects."""
     clear_dn = _CLEAR * float(np.sqrt(model.variance(model.black_dn)))
-    clear = [(d.peak > clear_dn) & (x < _OBJECT) for d, x in zip(found, left_over, strict=True)]
-    moving = [c & _moves(d, found[:k], found[k + 1 :]) for k, (d, c) in enumerate(zip(found, clear, strict=True))]
-    return moving if any(m.any() for m in moving) or is_limited_by_texture(model) else clear
+    return points[(points.peak > clear_dn) & (_left_over(points, model) < _OBJECT)]
+
+
+def _counted(found: Sequence[Detections], model: NoiseModel) -> list[Detections]:
+    """The clear points of each picture that move; where nothing moves, all."""
+    clear = [_clear(points, model) for points in found]
+    moving = [points[_moves(points, found[:k], found[k + 1 :])] for k, points in enumerate(clear)]
+    return moving if any(map(len, moving)) else clear
 
 
 def _parts(lights: Detections, points: Detections) -> Ints:

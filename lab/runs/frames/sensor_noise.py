@@ -77,6 +77,8 @@ class CameraNoise:
     px: float = 1.0  # side of its pixels, which may be sums, in pixels of the camera
     of_sums: CameraNoise | None = field(default=None, init=False)  # where speckle breaks spots into grains
     unfit: int = field(default=0, init=False)  # consecutive pictures that do not fit the background
+    # Of which the noise was estimated, until a background is made: it may show that sums are better
+    _first: list[Picture] = field(default_factory=list, init=False)
     _overruled: bool = field(default=False, init=False)  # the stated noise misses visible spots
     _blank: int = field(default=0, init=False)  # consecutive pictures without any point
     _recent: deque[Picture] = field(default_factory=lambda: deque(maxlen=2), init=False)
@@ -91,6 +93,7 @@ class CameraNoise:
         self.estimate = estimate_noise(pictures, self._black_dn)
         self.mosaic = mosaic_contrast(pictures[0])
         self._update_model()
+        self._first = list(pictures) if self.shows_structure and not self.estimate.grainy else []
         self.of_sums = self._of_sums(pictures) if self.estimate.grainy else None
         if self.stated is not None:
             level = self.estimate.model.black_dn
@@ -144,6 +147,7 @@ class CameraNoise:
 
         call: calls a function with arguments, maybe in another process.
         """
+        given = pictures
         if pictures and self.of_sums is not None:
             sums = [squares_of(p, SIDE) for p in pictures]
             self.of_sums.make_background(sums, self._in_sums(parameters, pictures[0]), call)
@@ -163,6 +167,10 @@ class CameraNoise:
             shift, others_move = self.estimate.texture_shift, self.too_wide_px > 0
             background = call(static_background, pictures, self.model, shift, without_wide(usual), others_move)
             self.motion, self.wide, self.background = motion, wide, background
+            if background is not None and background.grainy and self._first:
+                self.of_sums = self._of_sums(self._first)
+                self.make_background(given, parameters, call)
+            self._first = []
 
     def _take_over(self, of_sums: CameraNoise) -> None:
         """What the sums of pixels show of the camera."""
