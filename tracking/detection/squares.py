@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,9 +21,10 @@ def squares_of(picture: Picture, side: int = WIDE_SIDE) -> NDArray[np.uint16]:
     side: of the squares, px, at most 8.
     """
     height, width = (n // side for n in picture.shape)
-    rows = picture[: side * height, : side * width].reshape(height, side, -1).sum(axis=1, dtype=np.uint32)
-    sums = rows.reshape(height, width, side).sum(axis=2, dtype=np.uint32)
-    return np.rint(sums * (_gain_of_squares(picture, side) / side**2)).astype(np.uint16)
+    if not (height and width):
+        return np.zeros((height, width), np.uint16)
+    whole = picture[: side * height, : side * width].astype(np.uint16) * np.uint16(_gain_of_squares(picture, side))
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint16)
 
 
 def _gain_of_squares(picture: Picture, side: int) -> float:

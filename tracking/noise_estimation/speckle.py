@@ -32,26 +32,27 @@ _GRAINY, _OBJECT, _EVEN = 0.075, 0.25, 0.03
 _FEWEST_LIGHTS = 4  # whose median counts
 _INSIDE = 2.0  # widths of a light in sums: points that are nearer to its centre are parts of it ...
 _SHARE = 0.05  # ... with at least this share of its flux
-_OFTEN, _FEWEST = 0.08, 2  # share and number of the lights that consist of several points
+_OFTEN, _FEWEST = 0.08, 2  # share and number of the lights that consist of several points ...
+_MOSTLY = 0.5  # ... in front of objects, where there is one in each picture
 
 
 def shows_grains(pictures: Sequence[Picture], found: Sequence[Detections], model: NoiseModel, clips_dn: float) -> bool:
     """Whether spots of these pictures (h, w) of a camera are grainy, or several of the points found in each of them.
 
-    Then they are measured better in sums of SIDE x SIDE pixels. Not in front of objects, which are grainy, too: there
-    those that move in front of a background show it. clips_dn: grey value at which the sensor clips.
+    Then they are measured better in sums of SIDE x SIDE pixels. Objects are grainy, too: in front of them most lights
+    must be, or those that move in front of a background. clips_dn: grey value at which the sensor clips.
     """
-    if is_limited_by_texture(model):
-        return False
-    counted = _counted(found, model)
-    if grainy(counted, model):
+    objects = is_limited_by_texture(model)
+    counted = _counted(found, model, objects)
+    if not objects and grainy(counted, model):
         return True
     if not any(map(len, counted)) or np.median(np.concatenate([_left_over(c, model) for c in counted])) < _EVEN:
         return False
     usual = replace(DetectParameters(), saturation_dn=clips_dn)
-    lights = _counted([_in_sums(picture, usual, model) for picture in pictures], model)
+    lights = _counted([_in_sums(picture, usual, model) for picture in pictures], model, objects)
     several = np.concatenate([_parts(some, points) for some, points in zip(lights, found, strict=True)]) > 1
-    return bool(np.count_nonzero(several) >= _FEWEST and several.mean() > _OFTEN)
+    often, fewest = (_MOSTLY, len(pictures)) if objects else (_OFTEN, _FEWEST)
+    return bool(np.count_nonzero(several) >= fewest and several.mean() > often)
 
 
 def grainy(found: Sequence[Detections], model: NoiseModel) -> bool:
@@ -85,11 +86,11 @@ def _clear(points: Detections, model: NoiseModel) -> Detections:
     return points[(points.peak > clear_dn) & (_left_over(points, model) < _OBJECT)]
 
 
-def _counted(found: Sequence[Detections], model: NoiseModel) -> list[Detections]:
-    """The clear points of each picture that move; where nothing moves, all."""
+def _counted(found: Sequence[Detections], model: NoiseModel, objects: bool) -> list[Detections]:
+    """The clear points of each picture that move; where nothing moves, and there are no objects, all."""
     clear = [_clear(points, model) for points in found]
     moving = [points[_moves(points, found[:k], found[k + 1 :])] for k, points in enumerate(clear)]
-    return moving if any(map(len, moving)) else clear
+    return moving if objects or any(map(len, moving)) else clear
 
 
 def _parts(lights: Detections, points: Detections) -> Ints:

@@ -258,8 +258,8 @@ class CameraNoise:
             out = _scalars(self.model)
             out["source"] = "pictures" if self.stated is None or self._overruled else "rig"
             out["background_pictures"] = 0 if self.background is None else self.background.pictures
-            out["camera_motion_px"] = 0.0 if self.motion is None else self._innermost.px * self.motion.rms_px
-            out["summed_px"] = int(self._innermost.px)
+            out["camera_motion_px"] = 0.0 if self.motion is None else self.innermost.px * self.motion.rms_px
+            out["summed_px"] = int(self.innermost.px)
         if self.estimate is not None:
             seen = asdict(replace(self.estimate, model=replace(self.estimate.model, local_texture=None)))
             del seen["model"]
@@ -279,8 +279,9 @@ class CameraNoise:
         return None if self.stated is None or self.stated.black_dn <= 0 else self.stated.black_dn
 
     @property
-    def _innermost(self) -> CameraNoise:
-        return self if self.of_sums is None else self.of_sums._innermost
+    def innermost(self) -> CameraNoise:
+        """That of the pictures, or sums of pixels, in which the spots are measured."""
+        return self if self.of_sums is None else self.of_sums.innermost
 
     def _search(self, picture: Picture, parameters: DetectParameters, model: NoiseModel | None) -> Detections:
         return find_spots(picture, self._with_saturation(parameters, picture), model)
@@ -368,6 +369,12 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
             noise.follow_motion(usable, run.tracker.detect)
     else:
         noise.look_for_wide(pictures[::2], run.tracker.detect)
+    side = noise.innermost.px
+    if side > 1:
+        noise.notes.append(
+            f"{noise.camera}: speckle makes the spots grainy, so they are measured in sums of {side:.0f}x{side:.0f} pixels;"
+            " a wider aperture makes its grains, and the errors, smaller"
+        )
     rows = RowCounts()
     for first, second in zip(pictures[::2], pictures[1::2], strict=False):
         rows.add(first, second)
@@ -382,7 +389,7 @@ def share_texture(cameras: Sequence[CameraNoise]) -> None:
     A background may be too faint, spots may be too narrow. The screens and lasers of a laboratory are alike; without
     this such errors would be taken for noise. Of several textures the finest is taken, of several grains the coarsest.
     """
-    cameras = [c._innermost for c in cameras]
+    cameras = [c.innermost for c in cameras]
     estimates = [c.estimate for c in cameras if c.estimate is not None]
     grains = [c.grain for c in cameras if np.isfinite(c.grain)]
     for camera in cameras:
