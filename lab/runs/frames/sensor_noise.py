@@ -372,8 +372,8 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
     side = noise.innermost.px
     if side > 1:
         noise.notes.append(
-            f"{noise.camera}: speckle makes the spots grainy, so they are measured in sums of {side:.0f}x{side:.0f} pixels;"
-            " a wider aperture makes its grains, and the errors, smaller"
+            f"{noise.camera}: speckle makes the spots grainy, so they are measured in sums of {side:.0f}x{side:.0f}"
+            " pixels; a wider aperture makes its grains, and the errors, smaller"
         )
     rows = RowCounts()
     for first, second in zip(pictures[::2], pictures[1::2], strict=False):
