@@ -15,11 +15,11 @@ import numpy as np
 from tracking.background.estimation import MOSTLY
 from tracking.background.static_background import StaticBackground
 from tracking.detection.detect import WIDE_PX, for_wide, wide_of_squares
-from tracking.detection.squares import noise_of_squares, squares_of
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.texture_shift import TextureShift
 from tracking.parameters import DetectParameters
+from tracking.squares import noise_of_squares, squares_of
 
 _WIDEST_PX = 8 * WIDE_PX  # as wide as the widest spot, in sums of pixels
 # Variance over that of sums of independent pixels. In sums there is so little noise that what a light's tails leave far

@@ -18,11 +18,11 @@ from tracking.detection.measuring import DetectionLimits, Wings, measure
 from tracking.detection.pixels import TEXTURE_SHARE, Noise, Pixels
 from tracking.detection.regions import EVERYWHERE, MARGIN, boxes_of, write_detections
 from tracking.detection.search import BORDER_BLOCKS, MAX_COMPARED, find_peaks_in, find_separate_peaks
-from tracking.detection.squares import WIDE_SIDE, for_squares, noise_of_squares, of_squares, squares_of
 from tracking.detection.table import ALGEBRA, CANDIDATE, CELL_ROWS, MOST_CELLS, PEAK, Peaks
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
+from tracking.squares import WIDE_SIDE, for_squares, noise_of_squares, of_squares, squares_of
 
 _thread_local = threading.local()  # .finders: the last finders of each thread, by width, height, most points
 _MOST_FINDERS = 4  # per thread: memory of 4 sizes of pictures, as many as the cameras of a usual rig

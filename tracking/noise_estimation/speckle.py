@@ -16,11 +16,11 @@ import numpy as np
 
 from geometry.arrays import Array, Bools, Ints
 from tracking.detection.detect import find_spots
-from tracking.detection.squares import for_squares, noise_of_squares, of_squares, squares_of
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.texture import is_limited_by_texture
 from tracking.parameters import DetectParameters
+from tracking.squares import for_squares, noise_of_squares, of_squares, squares_of
 
 SIDE = 2  # px: of the squares; where that is not enough, sums of sums
 _WIDTH = 2.4  # px: of a spot, at least: in sums its place within a square hardly matters then

@@ -31,7 +31,6 @@ from tracking.detection.detect import (
     saturation_of,
     without_wide,
 )
-from tracking.detection.squares import for_squares, of_squares, squares_of
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.averaging import RowCounts, kept_of_the_last
@@ -40,6 +39,7 @@ from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_no
 from tracking.noise_estimation.speckle import SIDE
 from tracking.noise_estimation.texture import is_limited_by_texture
 from tracking.parameters import DetectParameters
+from tracking.squares import for_squares, of_squares, squares_of
 
 VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # used for the estimate: the end of a video cannot be read without all of it
 _SMALL_PX = 0.1  # sigma of the mean attitude of a camera: below it, that is no more than the error of a usual spot
