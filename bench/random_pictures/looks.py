@@ -30,7 +30,7 @@ class Look:
     texture: float  # contrast of the surface
     texture_grain_px: float
     speckle: float  # contrast, for laser light only
-    speckle_grain_px: float
+    speckle_grain_px: float  # 1 sigma
     flicker: float  # of the ambient light, share
     drift: float  # of the ambient light over the recording, share
     reflections: int  # wide humps per picture
@@ -46,6 +46,7 @@ class Look:
     plain_rig: bool = False  # the rig of the paper at 1280 x 1024
     shake_px: float = 0.0  # rotation of each camera in each picture, about each axis, times its focal length; rms
     bands: float = 0.0  # of the ambient light, share: lamps that flicker while the sensor reads its rows; amplitude
+    patterns: int = 0  # independent ones in fully developed speckle; 0: lognormal speckle
     photograph: float = 0.0  # share of the laser light that the darkest place of a photograph takes; 0: no photograph
 
     @property
@@ -198,6 +199,12 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     "bands": lambda r, k: replace(_photographs(r, k), bands=_log(r, 0.02, 0.3)),
     "shaking": lambda r, k: replace(_photographs(r, k), shake_px=_log(r, 0.03, 1.0)),
     "row-noise": lambda r, k: replace(k, sensor=replace(k.sensor, row_e=float(r.uniform(0.5, 1.0) * k.sensor.read_e))),
+    # Physical: intensities of fields of random phases, seen through a round aperture; two patterns: both polarisations.
+    "laser": lambda r, k: (
+        lambda patterns: replace(
+            k, patterns=patterns, speckle=patterns**-0.5, speckle_grain_px=_log(r, 0.15, 0.6), sigma_px=_log(r, 0.9, 5)
+        )
+    )(int(r.integers(1, 3))),
 }  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from bench.random_pictures.looks import Look, draw_look
 from bench.random_pictures.optics import BeamShape
 from bench.random_pictures.sensors import Light
-from bench.random_pictures.spots import BeamEnd, draw_speckle
+from bench.random_pictures.spots import BeamEnd, draw_developed_speckle, draw_speckle
 from bench.random_scenes.drafts import paper_lab
 from bench.random_scenes.draw.motions import MOTIONS, Motion, draw_motion
 from bench.random_scenes.draw.nuisances import FalsePoints, draw_hidden, draw_missing
@@ -162,8 +162,12 @@ def _disturbances(
 def _beam_ends(rng: np.random.Generator, look: Look, scene: Scene) -> tuple[tuple[BeamEnd, ...] | None, Array]:
     """The light of the views; the median view has the given width. None if a view has no valid position."""
     rig = scene.rig
+    fine = 2 if look.patterns == 0 else int(np.ceil(1 / look.speckle_grain_px)) + 1
     speckles: dict[str, Light | None] = {
-        name: draw_speckle(rng, look.speckle, look.speckle_grain_px) for name in rig.cameras
+        name: draw_developed_speckle(rng, look.patterns, look.speckle_grain_px, fine)
+        if look.patterns
+        else draw_speckle(rng, look.speckle, look.speckle_grain_px)
+        for name in rig.cameras
     }
     unit = BeamShape(1e-3, 0.0)
     probes = []
@@ -194,7 +198,7 @@ def _beam_ends(rng: np.random.Generator, look: Look, scene: Scene) -> tuple[tupl
     }  # fmt: skip
     power = dict(zip(rig.beams, 1 - look.power_spread * rng.random(len(rig.beams)), strict=True))
     ends = tuple(
-        BeamEnd(p.camera, p.screen, p.beam, p.spot, beams[p.spot.beam], look.blur_px, speckles[p.camera.name])
+        BeamEnd(p.camera, p.screen, p.beam, p.spot, beams[p.spot.beam], look.blur_px, speckles[p.camera.name], fine)
         for p in probes
     )
     return ends, np.array([power[p.spot.beam] for p in probes])

@@ -26,6 +26,8 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.rig import Beam, Screen, Spot
 
+AIRY_SIGMA = 0.42  # sigma of the Gaussian most like the spot of an aperture, in wavelengths times the aperture number
+
 
 @dataclass(frozen=True, slots=True)
 class BeamEnd:
@@ -37,7 +39,8 @@ class BeamEnd:
     spot: Spot
     shape: BeamShape
     blur_px: float
-    speckle: Light | None  # twice as fine as the pixels, periodic, mean 1; None: none
+    speckle: Light | None  # `SPECKLE_PARTS` times as fine as the pixels, periodic, mean 1; None: none
+    speckle_parts: int = 2
 
     def rays(self, world_from_body: Pose) -> tuple[Array, Array, Array]:
         """Of a stack of poses (S,): start (S, 3) m, unit axis (S, 3), two unit vectors across it (S, 2, 3), world."""
@@ -98,7 +101,9 @@ class BeamEnd:
             return None
         narrow = float(np.linalg.eigvalsh(covariance)[0]) - 1 / 12
         own = np.sqrt(max(narrow - self.blur_px**2, 0.0))
-        parts = parts or max(samples_per_pixel(np.sqrt(narrow), own), 2 if self.speckle is not None else 1)
+        parts = parts or max(
+            samples_per_pixel(np.sqrt(narrow), own), self.speckle_parts if self.speckle is not None else 1
+        )
         u, v = (fine_pixels(low[i], high[i] - low[i], parts) for i in (0, 1))
         seen = screen_points(self.camera, self.screen, hits[middle], u, v)
         if seen is None:
@@ -106,7 +111,7 @@ class BeamEnd:
         fine = blurred(self._irradiance(world_from_body, *seen), self.blur_px, parts)
         if self.speckle is not None:
             n = len(self.speckle)
-            rows, columns = (np.floor(2 * (x + 0.5)).astype(int) % n for x in (v, u))
+            rows, columns = (np.floor(self.speckle_parts * (x + 0.5)).astype(int) % n for x in (v, u))
             fine = fine * self.speckle[np.ix_(rows, columns)]
         (left, top), (right, bottom) = first - low, last - low
         return Patch(int(first[0]), int(first[1]), pixel_means(fine, parts)[top:bottom, left:right])
@@ -138,6 +143,21 @@ def draw_speckle(rng: np.random.Generator, contrast: float, grain_px: float) -> 
     field = periodic_field(rng, 1024, 2 * grain_px)
     width = np.sqrt(np.log1p(contrast**2))
     return np.asarray(np.exp(width * field - width**2 / 2), dtype=np.float32)
+
+
+def draw_developed_speckle(rng: np.random.Generator, patterns: int, grain_px: float, parts: int) -> Light:
+    """A periodic field of mean 1: fully developed speckle, `parts` times as fine as the pixels, 1536 samples wide.
+
+    patterns: independent ones of the same mean. Each is the square of a complex field of random phases, of which a
+    round aperture lets the low frequencies pass. grain_px: sigma of a Gaussian as wide as the aperture's own spot.
+    """
+    size, total = 1536, 0.0
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.fftfreq(size)))
+    passed = frequency < AIRY_SIGMA / (2 * grain_px * parts)
+    for _ in range(patterns):
+        field = np.fft.ifft2(np.fft.fft2(np.exp(2j * np.pi * rng.random((size, size)))) * passed)
+        total = total + np.abs(field) ** 2
+    return np.asarray(total / np.mean(total), dtype=np.float32)
 
 
 def periodic_field(rng: np.random.Generator, size: int, sigma: float) -> Light:

@@ -20,6 +20,7 @@ from tracking.background.static_background import TRIED, StaticBackground
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
+from tracking.noise_estimation.speckle import grainy
 from tracking.noise_estimation.texture_shift import TextureShift, local_shifts, shifts_at_rest
 from tracking.parameters import DetectParameters
 
@@ -233,7 +234,10 @@ def _with_shifts(
         shifts_px = np.float32(part) * local_shifts(*modulation.sensitivity(mean, own), width)
     _subtract(still[~gaussian], mean, own)
     rest_shifts_px = shift.over_light * shifts_at_rest(mean, own, still)
-    return replace(better, spot_px=width, shifts_px=shifts_px, rest_shifts_px=rest_shifts_px, misfit_share=share)
+    return replace(
+        better, spot_px=width, shifts_px=shifts_px, rest_shifts_px=rest_shifts_px, misfit_share=share,
+        grainy=grainy(alone, background.noise),
+    )  # fmt: skip
 
 
 def _subtract(lights: Detections, mean: NDArray[np.float32], own: NDArray[np.float32]) -> None:

@@ -82,6 +82,7 @@ class StaticBackground:
     rest_shifts_px: Array | None = None
     fixed: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))  # lights at rest while others move
     misfit_share: float = float("nan")  # of the lights that move, as in TextureShift
+    grainy: bool = False  # those lights, as in NoiseEstimate
     # (h, w), in 2^-GAIN_BITS: undoes what the brightness of the surface does to a light; None: nothing
     gain: NDArray[np.uint16] | None = None
     # Of each texture: the lights at rest with their errors, and the errors by the texture in the light that moves.

@@ -14,11 +14,12 @@ import numpy as np
 
 from tracking.background.estimation import MOSTLY
 from tracking.background.static_background import StaticBackground
-from tracking.detection.detect import WIDE_PX, for_squares, noise_of_squares, of_squares, squares_of
+from tracking.detection.detect import WIDE_PX, for_wide, wide_of_squares
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture
 from tracking.noise_estimation.texture_shift import TextureShift
 from tracking.parameters import DetectParameters
+from tracking.squares import noise_of_squares, squares_of
 
 _WIDEST_PX = 8 * WIDE_PX  # as wide as the widest spot, in sums of pixels
 # Variance over that of sums of independent pixels. In sums there is so little noise that what a light's tails leave far
@@ -45,7 +46,7 @@ class WideLights:
 
         None: it makes no background of them, or nothing wide changes and max_sigma_px admits nothing wide.
         """
-        every = for_squares(replace(parameters, max_sigma_px=_WIDEST_PX), pictures[0])
+        every = for_wide(replace(parameters, max_sigma_px=_WIDEST_PX), pictures[0])
         of_sums = noise_of_squares(replace(model, correlation=_UNMODELLED * model.correlation), pictures[0])
         squares = [squares_of(p) for p in pictures]
         if parameters.max_sigma_px <= WIDE_PX and not _changes_widely(squares, of_sums):
@@ -56,7 +57,7 @@ class WideLights:
         excluded = Detections.none()
         for picture, sums in zip(pictures, squares, strict=True):
             parts = background.parts(sums, every, _NO_TEXTURE)
-            moving = Detections.none() if parts is None else of_squares(parts[0], picture)
+            moving = Detections.none() if parts is None else wide_of_squares(parts[0], picture)
             excluded = excluded.joined(moving[moving.major_px > parameters.max_sigma_px][:1], len(pictures))
         often = len(excluded) > MOSTLY * len(pictures)
         width = float(np.median(excluded.major_px)) if often else np.inf
@@ -68,8 +69,8 @@ class WideLights:
 
         None: the picture and the background do not fit.
         """
-        found = self.background.found_in(squares_of(picture), for_squares(parameters, picture), _NO_TEXTURE)
-        return None if found is None else of_squares(found, picture)
+        found = self.background.found_in(squares_of(picture), for_wide(parameters, picture), _NO_TEXTURE)
+        return None if found is None else wide_of_squares(found, picture)
 
 
 def _changes_widely(squares: Sequence[Picture], noise: NoiseModel) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from geometry.arrays import Array, Bools, Ints
 from geometry.camera import SensorNoise
@@ -22,12 +22,12 @@ from tracking.detection.table import ALGEBRA, CANDIDATE, CELL_ROWS, MOST_CELLS, 
 from tracking.detections import Detections
 from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.parameters import DetectParameters
+from tracking.squares import WIDE_SIDE, for_squares, noise_of_squares, of_squares, squares_of
 
 _thread_local = threading.local()  # .finders: the last finders of each thread, by width, height, most points
 _MOST_FINDERS = 4  # per thread: memory of 4 sizes of pictures, as many as the cameras of a usual rig
 
 WIDE_PX = 30.0  # sigma above which a light is sought in sums of pixels; a plain fit has windows for twice that
-_SIDE = 8  # px: side of the squares
 _BRIGHT = 0.5  # share of the picture's range that the peak of a light must have to be named as overlooked
 _INSIDE = 2.0  # sigmas of a wide light: detections of its speckle and its edges are nearer than this ...
 _PART = 1 / 3  # ... and wider than this share of it; a narrower one is a spot of its own
@@ -83,52 +83,21 @@ def of_all_sizes(narrow: Detections, wide: Detections, parameters: DetectParamet
 def find_wide_lights(picture: Picture, parameters: DetectParameters, noise: NoiseModel | None) -> Detections:
     """Lights (n) with a sigma of WIDE_PX to max_sigma_px in a grey picture (h, w); flux in DN of its pixels."""
     squares = squares_of(picture)
-    if min(squares.shape) < 2 * _SIDE:
+    if min(squares.shape) < 2 * WIDE_SIDE:
         return Detections.none()
     of_sums = noise_of_squares(noise or guess_noise(picture), picture)
-    return of_squares(find_spots(squares, for_squares(parameters, picture), of_sums), picture)
+    return wide_of_squares(find_spots(squares, for_wide(parameters, picture), of_sums), picture)
 
 
-def squares_of(picture: Picture) -> NDArray[np.uint16]:
-    """(h / 8, w / 8): sums of 8x8 pixels of a grey picture (h, w); means of 16 bit ones, whose sums have no room."""
-    height, width = (n // _SIDE for n in picture.shape)
-    rows = picture[: _SIDE * height, : _SIDE * width].reshape(height, _SIDE, -1).sum(axis=1, dtype=np.uint32)
-    sums = rows.reshape(height, width, _SIDE).sum(axis=2, dtype=np.uint32)
-    return np.rint(sums * (_gain_of_squares(picture) / _SIDE**2)).astype(np.uint16)
+def for_wide(parameters: DetectParameters, picture: Picture) -> DetectParameters:
+    """The same for wide lights in `squares_of` a picture."""
+    usual = replace(parameters, saturation_dn=saturation_of(parameters, picture))
+    return replace(for_squares(usual, picture), min_sigma_px=0.5 * WIDE_PX / WIDE_SIDE)
 
 
-def _gain_of_squares(picture: Picture) -> float:
-    """Grey value in `squares_of` a picture over that in the picture."""
-    return float(_SIDE**2) if picture.dtype == np.uint8 else 1.0
-
-
-def noise_of_squares(noise: NoiseModel, picture: Picture) -> NoiseModel:
-    """That of `squares_of` a picture: the noise of a sum of pixels is that of its pixels."""
-    model, pixels, gain = noise.of_means, float(_SIDE**2), _gain_of_squares(picture)
-    return NoiseModel(
-        gain**2 * model.floor_dn2 / pixels + 1 / 12, gain * model.slope_dn / pixels, gain * model.black_dn,
-        model.texture, gain * model.banding_dn,
-    )  # fmt: skip
-
-
-def for_squares(parameters: DetectParameters, picture: Picture) -> DetectParameters:
-    """The same in `squares_of` a picture."""
-    return replace(
-        parameters, min_sigma_px=0.5 * WIDE_PX / _SIDE, max_sigma_px=parameters.max_sigma_px / _SIDE,
-        saturation_dn=_gain_of_squares(picture) * saturation_of(parameters, picture),
-    )  # fmt: skip
-
-
-def of_squares(found: Detections, picture: Picture) -> Detections:
+def wide_of_squares(found: Detections, picture: Picture) -> Detections:
     """Of the points found in `squares_of` a picture those wider than WIDE_PX, in its pixels and grey values."""
-    pixels, gain = float(_SIDE**2), _gain_of_squares(picture)
-    found = found[_SIDE * found.major_px > WIDE_PX]
-    return replace(
-        found, uv_px=_SIDE * found.uv_px + 0.5 * (_SIDE - 1), cov_px2=pixels * found.cov_px2,
-        flux=pixels / gain * found.flux, peak=found.peak / gain,
-        major_px=_SIDE * found.major_px, minor_px=_SIDE * found.minor_px,
-        place_px2=None if found.place_px2 is None else pixels * found.place_px2,
-    )  # fmt: skip
+    return of_squares(found[WIDE_SIDE * found.major_px > WIDE_PX], picture)
 
 
 def limit_that_admits(sigma_px: float) -> int:

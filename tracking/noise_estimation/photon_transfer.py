@@ -25,6 +25,7 @@ from tracking.noise_estimation.grey_values import (
     saturation_level,
 )
 from tracking.noise_estimation.levels import LEAST_PIXELS, LEVELS, SIDE, LevelVariances, level_variances
+from tracking.noise_estimation.speckle import shows_grains
 from tracking.noise_estimation.spot_profile import spot_profile
 from tracking.noise_estimation.spot_residuals import SpotResiduals, residuals_of_spots
 from tracking.noise_estimation.texture import MeanPicture, local_texture, texture_of
@@ -62,6 +63,7 @@ class NoiseEstimate:
     pictures: int  # number of pictures used
     temporal: bool  # from differences in time; False: within pictures, where structure counts as noise
     texture_shift: TextureShift = field(default_factory=TextureShift.none)  # errors of spots due to texture
+    grainy: bool = False  # speckle makes the spots so grainy that they are measured better in sums of pixels
 
 
 def estimate_noise(pictures: Sequence[Picture], black_dn: float | None = None) -> NoiseEstimate:
@@ -116,7 +118,8 @@ def estimate_noise(pictures: Sequence[Picture], black_dn: float | None = None) -
     shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full, found, black_dn)
     shift = shift.with_lights(found)
     model = replace(model, profile=spot_profile(usable, found, model, saturation))
-    return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift)
+    grainy = shows_grains(usable, found, model, top)
+    return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift, grainy)
 
 
 def _small_picture_variance(pictures: Sequence[Picture]) -> float:

@@ -38,6 +38,9 @@ _FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are average
 _NARROWEST_PX = 0.5  # half axis, with the pixel's own width
 _USUAL = 0.3  # quantile of the lights' misfits: of reflections and other clutter many have larger ones than spots
 _RESOLVED_PX, _CLEAR = 1.8, 0.02  # width from which a misfit shows; noise of the centre, in widths, of clear lights
+# Share of the width by which developed speckle moves a centre, at least: 0.06 to 0.3. Texture moves it by up to 0.04,
+# pixels by less, so above this narrow lights count as well.
+DEVELOPED_SPECKLE = 0.06
 _FEWEST_LIGHTS = 6  # whose quantile is used
 _WIDER = 4.0  # times the usual width: no spot
 _CLEARLY_MORE = 6.0  # ratio of the variance that a fit shows to that expected: of one spot it has a factor of two
@@ -85,6 +88,7 @@ class TextureShift:
 
         Reflections are much wider than the spots, which are the bright lights, and no Gaussians.
         """
+        narrow: list[float] = []
         shares: list[float] = []
         widths = [np.sqrt(points.major_px * points.minor_px) for points in found]
         every, peaks = np.concatenate([*widths, np.zeros(1)]), np.concatenate([*(p.peak for p in found), np.zeros(1)])
@@ -94,11 +98,13 @@ class TextureShift:
         for points, width in zip(found, widths, strict=True):
             variance = points.variance_px2
             misfit = np.zeros(len(points)) if points.misfit is None else points.misfit
-            clear = (
-                (width > _RESOLVED_PX) & (width < _WIDER * usual_px) & (variance * (1 - misfit) < (_CLEAR * width) ** 2)
-            )
-            shares.extend(np.sqrt(misfit * variance)[clear] / width[clear])
-        return replace(self, misfit_share=float(np.quantile(shares, _USUAL))) if len(shares) >= _FEWEST_LIGHTS else self
+            clear = (width < _WIDER * usual_px) & (variance * (1 - misfit) < (_CLEAR * width) ** 2)
+            share, wide = np.sqrt(misfit * variance) / width, width > _RESOLVED_PX
+            shares.extend(share[clear & wide])
+            narrow.extend(share[clear & ~wide])
+        usual, of_all = _usual_of(shares), _usual_of(narrow + shares)
+        usual = of_all if of_all > DEVELOPED_SPECKLE else usual
+        return replace(self, misfit_share=usual) if np.isfinite(usual) else self
 
     @property
     def of_light(self) -> TextureShift:
@@ -163,6 +169,10 @@ class TextureShift:
             axes = np.stack([width_px, width_px, np.zeros(len(found))])
         cov_px2, place_px2 = _with_errors(np.asarray(found.cov_px2), misfit, axes, sigma_px, self.misfit_share)
         return replace(found, cov_px2=cov_px2, place_px2=place_px2)
+
+
+def _usual_of(shares: Sequence[float]) -> float:
+    return float(np.quantile(shares, _USUAL)) if len(shares) >= _FEWEST_LIGHTS else float("nan")
 
 
 @compiled

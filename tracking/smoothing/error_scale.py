@@ -11,6 +11,7 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints, evenly_spread
 from geometry.compiled_projection import Views, project_all
 from geometry.forward_model import SpotModel
+from tracking.noise_estimation.texture_shift import DEVELOPED_SPECKLE
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.online_estimates import DEADBAND
@@ -152,7 +153,8 @@ def usual_misfit(run: RunDetections, place_px2: Array, assigned: Ints, camera_of
 
     The grain of the light is the same for all spots of a camera, but does not show in each fit: each spot has at least
     half of their mean variance, or the median where few spots, on edges of the background, have most of it. A camera
-    whose spots are too narrow to show it takes that of the others.
+    whose spots are too narrow to show it takes that of the others. Developed speckle is larger than what else leaves a
+    misfit: there narrow spots show it, too, and a fit hardly shows its own error, so that each has the mean.
     """
     share2, size = np.full(assigned.shape, np.nan), np.full(assigned.shape, np.nan)
     labelled = (assigned >= 0) & (assigned < BLENDED)
@@ -162,12 +164,19 @@ def usual_misfit(run: RunDetections, place_px2: Array, assigned: Ints, camera_of
     out = np.full(run.has_image.shape[1], np.nan)
     for camera in range(len(out)):
         some, wide = share2[:, camera_of == camera], size[:, camera_of == camera] > _RESOLVED_PX
-        shares = np.sort(some[wide & np.isfinite(some)])
-        if len(shares) >= _LEAST_CHANGES:
-            cut = len(shares) // 10
-            out[camera] = np.sqrt(min(0.5 * np.mean(shares[cut : len(shares) - cut]), np.median(shares)))
+        every, shares = (np.sort(some[which & np.isfinite(some)]) for which in (True, wide))
+        if len(every) >= _LEAST_CHANGES and min(_middle(every), np.median(every)) > DEVELOPED_SPECKLE**2:
+            out[camera] = np.sqrt(_middle(every))
+        elif len(shares) >= _LEAST_CHANGES:
+            out[camera] = np.sqrt(min(0.5 * _middle(shares), np.median(shares)))
     usual = float(np.nanmax(out)) if np.isfinite(out).any() else 0.0
     return np.where(np.isnan(out), usual, out)
+
+
+def _middle(values: Array) -> float:
+    """The mean of sorted values without a tenth at each end."""
+    cut = len(values) // 10
+    return float(np.mean(values[cut : len(values) - cut]))
 
 
 def widened(detections: RunDetections, share: Array | float) -> RunDetections:

@@ -36,8 +36,10 @@ from tracking.noise import NoiseModel, Picture, guess_noise
 from tracking.noise_estimation.averaging import RowCounts, kept_of_the_last
 from tracking.noise_estimation.grey_values import mosaic_contrast
 from tracking.noise_estimation.photon_transfer import NoiseEstimate, estimate_noise
+from tracking.noise_estimation.speckle import SIDE
 from tracking.noise_estimation.texture import is_limited_by_texture
 from tracking.parameters import DetectParameters
+from tracking.squares import for_squares, of_squares, squares_of
 
 VIDEO_PICTURES = (0, 1, 8, 9, 16, 17)  # used for the estimate: the end of a video cannot be read without all of it
 _SMALL_PX = 0.1  # sigma of the mean attitude of a camera: below it, that is no more than the error of a usual spot
@@ -72,7 +74,11 @@ class CameraNoise:
     interlaced: bool = field(default=False, init=False)  # even and odd rows show two instants
     wide: WideLights | None = field(default=None, init=False)  # None: sums of pixels have no background
     too_wide_px: float = field(default=0.0, init=False)  # sigma of a light that max_sigma_px excludes; 0: none
+    px: float = 1.0  # side of its pixels, which may be sums, in pixels of the camera
+    of_sums: CameraNoise | None = field(default=None, init=False)  # where speckle breaks spots into grains
     unfit: int = field(default=0, init=False)  # consecutive pictures that do not fit the background
+    # Of which the noise was estimated, until a background is made: it may show that sums are better
+    _first: list[Picture] = field(default_factory=list, init=False)
     _overruled: bool = field(default=False, init=False)  # the stated noise misses visible spots
     _blank: int = field(default=0, init=False)  # consecutive pictures without any point
     _recent: deque[Picture] = field(default_factory=lambda: deque(maxlen=2), init=False)
@@ -87,6 +93,8 @@ class CameraNoise:
         self.estimate = estimate_noise(pictures, self._black_dn)
         self.mosaic = mosaic_contrast(pictures[0])
         self._update_model()
+        self._first = list(pictures) if self.shows_structure and not self.estimate.grainy else []
+        self.of_sums = self._of_sums(pictures) if self.estimate.grainy else None
         if self.stated is not None:
             level = self.estimate.model.black_dn
             stated = float(NoiseModel.of(self.stated).variance(level))
@@ -97,6 +105,21 @@ class CameraNoise:
                     f" ({level:.4g} DN), the pictures show {np.sqrt(seen):.3g} DN; correct `noise` in rig.yaml, or"
                     " leave it out"
                 )
+
+    def _of_sums(self, pictures: Sequence[Picture]) -> CameraNoise:
+        """That of sums of SIDE x SIDE pixels of some pictures in temporal order."""
+        optics = self.optics
+        if optics is not None:
+            width, height = optics.image_size_px
+            matrix = np.diag([1 / SIDE, 1 / SIDE, 1.0]) @ optics.matrix
+            matrix[:2, 2] -= 0.5 * (1 - 1 / SIDE)
+            optics = replace(optics, image_size_px=(width // SIDE, height // SIDE), matrix=matrix)
+        out = CameraNoise(self.camera, notes=self.notes, optics=optics, px=SIDE * self.px)
+        out.estimate_from([squares_of(p, SIDE) for p in pictures])
+        return out
+
+    def _in_sums(self, parameters: DetectParameters, picture: Picture) -> DetectParameters:
+        return for_squares(self._with_saturation(parameters, picture), picture, SIDE)
 
     @property
     def grain(self) -> float:
@@ -124,10 +147,15 @@ class CameraNoise:
 
         call: calls a function with arguments, maybe in another process.
         """
-        if pictures and self.model is not None and self.estimate is not None:
+        given = pictures
+        if pictures and self.of_sums is not None:
+            sums = [squares_of(p, SIDE) for p in pictures]
+            self.of_sums.make_background(sums, self._in_sums(parameters, pictures[0]), call)
+            self._take_over(self.of_sums)
+        elif pictures and self.model is not None and self.estimate is not None:
             usual = self._with_saturation(parameters, pictures[0])
             moved_px = float(np.linalg.norm(shift_between(pictures[0], pictures[-1])))
-            self.moved_px = moved_px if moved_px > FARTHEST_PX else 0.0
+            self.moved_px = self.px * moved_px if moved_px > FARTHEST_PX else 0.0
             motion = None
             if self.optics is not None:
                 motion = call(CameraMotion.of, pictures, self.optics, self.model, without_wide(usual))
@@ -135,24 +163,43 @@ class CameraNoise:
                 clips = saturation_of(usual, pictures[0])
                 pictures = [still for p in pictures if (still := motion.stilled(p, clips)[0]) is not None]
             wide = WideLights.of(pictures, self.model, usual, partial(call, static_background))
-            self.too_wide_px = 0.0 if wide is None else wide.excluded_px
+            self.too_wide_px = 0.0 if wide is None else self.px * wide.excluded_px
             shift, others_move = self.estimate.texture_shift, self.too_wide_px > 0
             background = call(static_background, pictures, self.model, shift, without_wide(usual), others_move)
             self.motion, self.wide, self.background = motion, wide, background
+            if background is not None and background.grainy and self._first:
+                self.of_sums = self._of_sums(self._first)
+                self.make_background(given, parameters, call)
+            self._first = []
+
+    def _take_over(self, of_sums: CameraNoise) -> None:
+        """What the sums of pixels show of the camera."""
+        self.motion, self.background = of_sums.motion, of_sums.background
+        self.moved_px, self.too_wide_px = of_sums.moved_px, of_sums.too_wide_px
+
+    def forget_background(self) -> None:
+        """Search in pictures themselves until another background is made."""
+        self.background, self.unfit = None, 0
+        if self.of_sums is not None:
+            self.of_sums.forget_background()
 
     def follow_motion(self, pictures: Mapping[int, Picture], parameters: DetectParameters) -> None:
         """Find the mean attitude of a camera that moves in these pictures, by number, and note that it does."""
-        if self.motion is not None and pictures:
+        if self.of_sums is not None and pictures:
+            usual = self._in_sums(parameters, next(iter(pictures.values())))
+            self.of_sums.follow_motion({k: squares_of(p, SIDE) for k, p in pictures.items()}, usual)
+            self._take_over(self.of_sums)
+        elif self.motion is not None and pictures:
             clips = self.saturation_dn(next(iter(pictures.values())), parameters)
             self.motion = self.motion.with_mean_of(pictures, clips)
             how, remedy = "from picture to picture", ". Check its mount and the floor"
             if self.motion.is_slow:
                 how, remedy = "once or slowly", ". Find out when it was moved, and calibrate it again"
                 if self.motion.mean_variance_px2 > _SMALL_PX**2:  # a finding says when, and what to do
-                    self.moved_px, remedy = self.motion.farthest_px, ""
+                    self.moved_px, remedy = self.px * self.motion.farthest_px, ""
             self.notes.append(
-                f"{self.camera}: the camera moves by {self.motion.rms_px:.2g} px (rms) {how}; its spots are corrected"
-                f" by what stands still in its pictures{remedy}"
+                f"{self.camera}: the camera moves by {self.px * self.motion.rms_px:.2g} px (rms) {how}; its spots are"
+                f" corrected by what stands still in its pictures{remedy}"
             )
 
     def look_for_wide(self, pictures: Sequence[Picture], parameters: DetectParameters) -> None:
@@ -160,12 +207,17 @@ class CameraNoise:
         narrow = without_wide(parameters)
         found = [overlooked_lights(p, parameters, self.model, self._search(p, narrow, self.model)) for p in pictures]
         widest = [float(lights.major_px.max(initial=0.0)) for lights in found]
-        self.too_wide_px = float(np.median(widest)) if widest else 0.0
+        self.too_wide_px = self.px * float(np.median(widest)) if widest else 0.0
 
     def detect(self, picture: Picture, parameters: DetectParameters) -> Detections:
         """The points of one picture. After pictures without any point the noise is estimated again."""
         if self.model is None:
             self.estimate_from([picture])
+        if self.of_sums is not None:
+            usual = self._in_sums(parameters, picture)
+            found = of_squares(self.of_sums.detect(squares_of(picture, SIDE), usual), picture, SIDE)
+            self.unfit = self.of_sums.unfit
+            return found
         if self.motion is None:
             return self._points_in(picture, parameters)
         still, turn = self.motion.stilled(picture, self.saturation_dn(picture, parameters))
@@ -206,7 +258,8 @@ class CameraNoise:
             out = _scalars(self.model)
             out["source"] = "pictures" if self.stated is None or self._overruled else "rig"
             out["background_pictures"] = 0 if self.background is None else self.background.pictures
-            out["camera_motion_px"] = 0.0 if self.motion is None else self.motion.rms_px
+            out["camera_motion_px"] = 0.0 if self.motion is None else self.innermost.px * self.motion.rms_px
+            out["summed_px"] = int(self.innermost.px)
         if self.estimate is not None:
             seen = asdict(replace(self.estimate, model=replace(self.estimate.model, local_texture=None)))
             del seen["model"]
@@ -224,6 +277,11 @@ class CameraNoise:
     def _black_dn(self) -> float | None:
         """The stated grey value without light; 0 is that of a file that does not state it."""
         return None if self.stated is None or self.stated.black_dn <= 0 else self.stated.black_dn
+
+    @property
+    def innermost(self) -> CameraNoise:
+        """That of the pictures, or sums of pixels, in which the spots are measured."""
+        return self if self.of_sums is None else self.of_sums.innermost
 
     def _search(self, picture: Picture, parameters: DetectParameters, model: NoiseModel | None) -> Detections:
         return find_spots(picture, self._with_saturation(parameters, picture), model)
@@ -311,6 +369,12 @@ def _prepare(noise: CameraNoise, run: Run, source: PictureSource) -> None:
             noise.follow_motion(usable, run.tracker.detect)
     else:
         noise.look_for_wide(pictures[::2], run.tracker.detect)
+    side = noise.innermost.px
+    if side > 1:
+        noise.notes.append(
+            f"{noise.camera}: speckle makes the spots grainy, so they are measured in sums of {side:.0f}x{side:.0f}"
+            " pixels; a wider aperture makes its grains, and the errors, smaller"
+        )
     rows = RowCounts()
     for first, second in zip(pictures[::2], pictures[1::2], strict=False):
         rows.add(first, second)
@@ -325,6 +389,7 @@ def share_texture(cameras: Sequence[CameraNoise]) -> None:
     A background may be too faint, spots may be too narrow. The screens and lasers of a laboratory are alike; without
     this such errors would be taken for noise. Of several textures the finest is taken, of several grains the coarsest.
     """
+    cameras = [c.innermost for c in cameras]
     estimates = [c.estimate for c in cameras if c.estimate is not None]
     grains = [c.grain for c in cameras if np.isfinite(c.grain)]
     for camera in cameras:

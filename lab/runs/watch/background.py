@@ -135,7 +135,7 @@ class LiveBackground:
         busy = self._thread is not None and self._thread.is_alive()
         if self.noise.unfit >= _UNFIT and not busy:
             self._kept, self._spacing, self._next = [], _SPACING, 1
-            self.noise.background, self.noise.unfit = None, 0
+            self.noise.forget_background()
         self._next -= 1
         if self._next <= 0 and len(self._kept) < PICTURES:
             self._kept.append(picture)
