@@ -334,7 +334,7 @@ def test_the_version_is_that_of_the_installed_package():
 
 
 def points_run(folder: Path) -> Path:
-    return simulate("smooth", folder, seed=5, frames=5, detections_only=True)
+    return simulate("smooth", folder, seed=5, frames=5, points=True)
 
 
 @pytest.mark.parametrize(
@@ -413,7 +413,7 @@ def hears_signals() -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
 @pytest.mark.parametrize("sent", further_slow(["SIGTERM", "SIGHUP"]))
 def test_a_run_that_is_stopped_by_a_signal_leaves_nothing_and_says_so(tmp_path, sent):
-    simulate("smooth", tmp_path / "run", seed=5, frames=400, detections_only=True)
+    simulate("smooth", tmp_path / "run", seed=5, frames=400, points=True)
     command = [sys.executable, "-P", "-c", PROGRAM, "run", "run", "--out", "out"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, cwd=tmp_path, preexec_fn=hears_signals, **pipes) as running:
@@ -561,7 +561,7 @@ def test_a_stopped_batch_reports_it(tmp_path, monkeypatch):
 
 
 def test_ctrl_c_ends_a_watched_recording_and_writes_its_results(tmp_path):
-    simulate("smooth", tmp_path / "run", seed=5, frames=8, picture_scale=0.25)
+    simulate("smooth", tmp_path / "run", seed=5, frames=8, scale=0.25)
     command = [sys.executable, "-P", "-c", PROGRAM, "watch", "run", "--out", "out"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watching:
         until, table = time.monotonic() + 60, tmp_path / "out/attitude_live.csv"

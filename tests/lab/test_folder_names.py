@@ -26,7 +26,7 @@ def named(folder: Path, name: bytes) -> Path:
 def place(tmp_path_factory) -> Path:
     """A folder with a run and its results."""
     folder = named(tmp_path_factory.mktemp("disk"), b"Universit\xe9")
-    simulate("smooth", named(folder, b"caf\xe9"), seed=1, frames=8, detections_only=True)
+    simulate("smooth", named(folder, b"caf\xe9"), seed=1, frames=8, points=True)
     assert typed("run", named(folder, b"caf\xe9"), "--out", named(folder, b"r\xe9sultats")).exit_code == 0
     return folder
 

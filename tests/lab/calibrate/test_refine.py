@@ -49,8 +49,7 @@ def recordings(
     folder: Path, scenario: str = "two-cameras-per-screen", count: int = 2, frames: int = FRAMES
 ) -> list[Path]:
     return [
-        simulate(scenario, folder / f"run{i}", seed=i, frames=frames, detections_only=True, clutter=0.0)
-        for i in range(count)
+        simulate(scenario, folder / f"run{i}", seed=i, frames=frames, points=True, clutter=0.0) for i in range(count)
     ]
 
 

@@ -91,7 +91,7 @@ def test_the_rig_file_reads_back_with_the_same_joint_covariance(outcome):
 
 def test_errors_of_poses_measured_with_the_calibrated_rig_agree_with_their_covariance(project, outcome, tmp_path):
     """End to end: a recording of the true rig, tracked with the calibrated one."""
-    run = simulate("smooth", tmp_path / "run", seed=3, frames=12, detections_only=True, noise_px=0.054, clutter=0.0)
+    run = simulate("smooth", tmp_path / "run", seed=3, frames=12, points=True, noise_px=0.054, clutter=0.0)
     truth = load_rig(project / "truth" / "rig.yaml")
     true_poses = truth_poses(run)
     with (run / "detections.csv").open() as file:
@@ -236,7 +236,7 @@ def test_recordings_can_be_run_folders_with_unlabelled_spots(tmp_path):
     nothing = dict.fromkeys(("camera_m", "camera_deg", "screen_m", "screen_deg", "beam_deg", "beam_m"), 0.0)
     as_designed = CampaignQuality(**nothing, focal_px=0.0, centre_px=0.0, distortion_share=0.0)
     project = simulate_calibration(tmp_path / "lab", seed=5, quality=as_designed)
-    simulate("smooth", project / "run", seed=2, frames=60, detections_only=True, noise_px=0.054)
+    simulate("smooth", project / "run", seed=2, frames=60, points=True, noise_px=0.054)
     path = project / "calibration.yaml"
     text, count = re.subn(r"recordings:\n- .*\n", "recordings:\n- {run: run, use_truth: true}\n", path.read_text())
     assert count == 1

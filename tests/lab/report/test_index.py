@@ -20,7 +20,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a batch and its index: four good runs of four days, and a bad one of an unknown day."""
     folder = tmp_path_factory.mktemp("index")
     for number, day in enumerate(DAYS):
-        run = simulate("smooth", folder / f"run{number}", seed=number, frames=4, detections_only=True) / "run.yaml"
+        run = simulate("smooth", folder / f"run{number}", seed=number, frames=4, points=True) / "run.yaml"
         run.write_text(run.read_text() + (f"recorded: {day}\n" if day else ""))
     (folder / "run4" / "detections.csv").unlink()
     names = [str(folder / f"run{number}") for number in range(len(DAYS))]

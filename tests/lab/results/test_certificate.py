@@ -28,7 +28,7 @@ def run_folder(tmp_path_factory):
         tmp_path_factory.mktemp("run") / "run",
         seed=11,
         frames=30,
-        detections_only=True,
+        points=True,
         exposure_s=0.006,
     )
     rig_file = load_rig_file(folder / "rig.yaml")
@@ -115,7 +115,7 @@ def test_the_page_states_measurand_budget_and_traceability(results, run_folder):
 
 
 def test_a_rig_without_covariance_makes_an_incomplete_budget_that_says_so(tmp_path):
-    run = simulate("smooth", tmp_path / "run", seed=5, frames=10, detections_only=True)
+    run = simulate("smooth", tmp_path / "run", seed=5, frames=10, points=True)
     process_run(run, tmp_path / "out")
     (tmp_path / "out/budget.csv").unlink()  # as results of earlier versions
     (frame,) = certificate(tmp_path / "out", draws=0).frames

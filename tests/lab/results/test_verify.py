@@ -20,7 +20,7 @@ from lab.simulate.write import simulate
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run of points (`run`) and its results (`out`), made with a parameter that is not the default."""
     folder = tmp_path_factory.mktemp("verify")
-    run = simulate("smooth", folder / "run", seed=5, frames=12, detections_only=True)
+    run = simulate("smooth", folder / "run", seed=5, frames=12, points=True)
     arguments = [
         "run",
         str(run),

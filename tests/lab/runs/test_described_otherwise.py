@@ -98,7 +98,7 @@ def with_smaller_pixels(rig: Rig) -> Description:
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
     folder = tmp_path_factory.mktemp("given")
-    run = simulate("smooth", folder / "run", seed=7, frames=FRAMES, detections_only=True)
+    run = simulate("smooth", folder / "run", seed=7, frames=FRAMES, points=True)
     process_run(run, folder / "out")
     return run, read_poses(folder / "out")
 

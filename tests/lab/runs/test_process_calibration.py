@@ -25,7 +25,7 @@ DAY = datetime.date(2026, 3, 14)
 
 @pytest.fixture
 def run_folder(tmp_path):
-    return simulate("smooth", tmp_path / "run", seed=5, frames=10, detections_only=True)
+    return simulate("smooth", tmp_path / "run", seed=5, frames=10, points=True)
 
 
 def change_rig(run_folder, **changes):
@@ -87,7 +87,7 @@ def test_the_day_of_the_recording_counts_where_the_run_states_it(run_folder, tmp
 
 
 def test_a_batch_with_an_expired_calibration_ends_with_status_3(run_folder, tmp_path):
-    good = simulate("smooth", tmp_path / "good", seed=6, frames=8, detections_only=True)
+    good = simulate("smooth", tmp_path / "good", seed=6, frames=8, points=True)
     change_rig(
         run_folder,
         calibration=CalibrationState(date=DAY, verdict="FAIL", valid_until=None, reasons=("the stand did not roll",)),
@@ -125,7 +125,7 @@ def test_a_prior_that_the_first_pose_contradicts_is_a_reason_of_the_verdict(tmp_
 
     rank: among the reasons. The prior, or the pose, is wrong: the second scenario's poses contradict the truth.
     """
-    run_folder = simulate(scenario, tmp_path / "run", seed=5, frames=60, detections_only=True)
+    run_folder = simulate(scenario, tmp_path / "run", seed=5, frames=60, points=True)
     assert process_run(run_folder, tmp_path / "right").verdict.status == "pass"
     content = yaml.safe_load((run_folder / "run.yaml").read_text("utf-8"))
     at = content["prior"]["position_m"]

@@ -19,7 +19,7 @@ LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (INFO|WARNING|ERROR) 
 
 @pytest.fixture(scope="module")
 def points(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulate("smooth", tmp_path_factory.mktemp("log") / "run", seed=5, frames=6, detections_only=True)
+    return simulate("smooth", tmp_path_factory.mktemp("log") / "run", seed=5, frames=6, points=True)
 
 
 def typed(*arguments: str | Path) -> Result:

@@ -138,7 +138,7 @@ def test_the_pictures_and_detections_of_the_run_are_shown(tmp_path):
 
 
 def test_a_run_folder_is_processed_up_to_the_frame(tmp_path):
-    run = simulate("huo2015", tmp_path / "run", frames=30, detections_only=True, seed=11)
+    run = simulate("huo2015", tmp_path / "run", frames=30, points=True, seed=11)
     process_run(run, tmp_path / "out", causal=True)
     shown = show_frame(run, 20)
     assert shown.content.pose_words == pose_words(read_poses(tmp_path / "out"), 20)

@@ -25,7 +25,7 @@ from tests.lab.run_folders import write_run
 
 
 def points_run(folder: Path, seed: int = 5) -> Path:
-    return simulate("smooth", folder, seed=seed, frames=4, detections_only=True)
+    return simulate("smooth", folder, seed=seed, frames=4, points=True)
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:

@@ -27,13 +27,13 @@ LATE_S, ROW_TIMES_S = 0.013, {"left": 8e-6, "right": 5e-6}  # of the scenario `c
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("clocks") / "run"
-    return simulate("clocks", folder, seed=SEED, frames=FRAMES, detections_only=True)
+    return simulate("clocks", folder, seed=SEED, frames=FRAMES, points=True)
 
 
 @pytest.fixture(scope="module")
 def rest(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("static") / "run"
-    return simulate("static", folder, seed=SEED, frames=60, detections_only=True)
+    return simulate("static", folder, seed=SEED, frames=60, points=True)
 
 
 @pytest.fixture(scope="module")

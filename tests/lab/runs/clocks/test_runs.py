@@ -33,7 +33,7 @@ FRAMES, SEED = 40, 3
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("clocks") / "run"
-    return simulate("clocks", folder, seed=SEED, frames=FRAMES, detections_only=True)
+    return simulate("clocks", folder, seed=SEED, frames=FRAMES, points=True)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def attitude_rms_deg(folder: Path) -> float:
 
 
 def test_the_attitude_is_as_accurate_as_with_one_clock(results, tmp_path):
-    simulate("smooth", tmp_path / "run", seed=SEED, frames=FRAMES, detections_only=True)
+    simulate("smooth", tmp_path / "run", seed=SEED, frames=FRAMES, points=True)
     process_run(tmp_path / "run", tmp_path / "out")
     assert attitude_rms_deg(results) < 1.3 * attitude_rms_deg(tmp_path / "out")
 

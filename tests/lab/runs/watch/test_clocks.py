@@ -30,7 +30,7 @@ OPTIONS = WatchOptions(idle_s=1.5, timeout_s=5.0)
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A left camera of 100 Hz, and a right one that is 1.3 frames late and takes every second picture."""
-    run = simulate("clocks", tmp_path_factory.mktemp("clocks") / "run", seed=3, frames=FRAMES, picture_scale=0.25)
+    run = simulate("clocks", tmp_path_factory.mktemp("clocks") / "run", seed=3, frames=FRAMES, scale=0.25)
     content = yaml.safe_load((run / "run.yaml").read_text())
     late_s = content["cameras"]["right"].pop("time_offset_s")
     folder = run / "frames/right"

@@ -43,7 +43,7 @@ PATIENT = WatchOptions(idle_s=60.0, timeout_s=60.0)  # ends when it is stopped; 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulate("smooth", tmp_path_factory.mktemp("recorded") / "run", seed=3, frames=FRAMES, picture_scale=0.25)
+    return simulate("smooth", tmp_path_factory.mktemp("recorded") / "run", seed=3, frames=FRAMES, scale=0.25)
 
 
 def run_of_first_pictures(run: Path, out: Path, causal: bool = False) -> Path:
@@ -189,7 +189,7 @@ def test_a_watch_that_has_not_kept_up_says_what_became_of_the_pictures(latency, 
 def test_pictures_that_come_faster_than_they_are_searched_wait_for_the_first_background(tmp_path):
     """On a rough screen spots are found in front of a background only: here from the first picture on."""
     rough = replace(SCENARIOS["smooth"], light=Light(texture=0.12, peak_dn=20.0, background_dn=40.0))
-    run = simulate(rough, tmp_path / "run", seed=3, frames=50, picture_scale=0.25)
+    run = simulate(rough, tmp_path / "run", seed=3, frames=50, scale=0.25)
     shown = {}
     for rate_hz in (10.0, 10_000.0):
         text = yaml.safe_load((run / "run.yaml").read_text("utf-8"))
@@ -273,7 +273,7 @@ def test_only_the_live_table_of_a_killed_watch_may_be_replaced(recorded, tmp_pat
 
 
 def test_a_device_with_an_end_has_the_results_of_its_pictures(tmp_path):
-    recorded = simulate("smooth", tmp_path / "video", seed=3, frames=FRAMES, picture_scale=0.25, video=True)
+    recorded = simulate("smooth", tmp_path / "video", seed=3, frames=FRAMES, scale=0.25, video=True)
     content = yaml.safe_load((recorded / "run.yaml").read_text())
     ordinary = run_of_first_pictures(recorded, tmp_path / "ordinary")
     for camera in content["cameras"].values():
