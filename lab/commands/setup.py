@@ -14,6 +14,7 @@ from lab.commands.common import (
     FOLDER,
     ImageSize,
     NumberRange,
+    carry_out,
     complete_codes,
     complete_scenarios,
     conclude,
@@ -189,9 +190,7 @@ def verify(results: Path, run_folder: Path | None) -> None:
     """
     from lab.results.verify import verify as verify_results
 
-    with progress_bar(results.name) as progress:
-        found = verify_results(results, run_folder, progress)
-    conclude(found)
+    carry_out(results.name, lambda progress: verify_results(results, run_folder, progress))
 
 
 @click.command()

@@ -308,7 +308,7 @@ SURVEY = "point,x_m,y_m,z_m\nL1,-2.5,-1.0,-0.8\n"
         ),
         (POINTS.replace("v_px", "v_px,sigma_px").replace("250", "250,0"), SURVEY, "sigma_px: expected a number above"),
         (POINTS, None, "survey.csv: expected a table with columns .*, found no file"),
-        (POINTS, SURVEY.replace("-2.5,-1.0,-0.8", "-2500,-1000,-800"), "expected metres, got -2500; are these milli"),
+        (POINTS, SURVEY.replace("-2.5,-1.0,-0.8", "-2500,-1000,-800"), "x_m: expected metres, .* got -2500; are these"),
         (POINTS, SURVEY.replace("-0.8", "inf"), "survey.csv: line 2: z_m: expected a number, got inf"),
         (POINTS, SURVEY.replace("z_m", "depth"), "expected a column 'z_m' .world. or 'screen'"),
         (POINTS, "point,screen,x_m,y_m\nL1,lefft,1,1\n", "screen: expected a screen of the rig, got 'lefft'; did you"),
