@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 import os
@@ -34,6 +33,7 @@ from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
 from tests.marks import further_slow
 from tests.paths import ROOT
+from tests.tables import rows_of
 
 SAMPLE = ROOT / "sample_runs" / "huo2015"
 PICTURES = 12  # of each camera of the sample run, enough for every file of a result; `-m slow` takes all 220
@@ -227,8 +227,7 @@ def test_the_example_of_batch_has_a_row_for_every_run_and_an_index(desk, works):
     arguments = example("batch")
     works(*arguments)
     out = desk / arguments[-1]
-    with (out / "batch.csv").open() as table:
-        assert len(list(csv.DictReader(table))) == len(arguments) - 3
+    assert len(rows_of(out / "batch.csv")) == len(arguments) - 3
     assert (out / "index.html").is_file()
 
 
@@ -535,8 +534,7 @@ def test_a_batch_reports_every_run_and_ends_with_the_worst_status(tmp_path):
     for runs, status in (([good], 0), ([good, grey], 4), ([grey, tmp_path / "nowhere", good], 1)):
         done = typed("batch", *runs, "--out", out)
         assert done.exit_code == status
-        with (out / "batch.csv").open() as table:
-            assert [Path(r["run"]) for r in csv.DictReader(table)] == runs
+        assert [Path(r["run"]) for r in rows_of(out / "batch.csv")] == runs
         first_words = [line.split(":")[0] for line in done.stdout.splitlines()]
         assert [word for word in first_words if word != "done already"] == [*(r.name for r in runs), "table", "index"]
     assert "nowhere: expected a run folder, found nothing" in done.output

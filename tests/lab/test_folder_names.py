@@ -9,10 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 
-from cli import main
 from lab.simulate.write import simulate
+from tests.command import typed
 from tests.paths import ROOT
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
@@ -29,10 +28,6 @@ def place(tmp_path_factory) -> Path:
     simulate("smooth", named(folder, b"caf\xe9"), seed=1, frames=8, points=True)
     assert typed("run", named(folder, b"caf\xe9"), "--out", named(folder, b"r\xe9sultats")).exit_code == 0
     return folder
-
-
-def typed(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 def test_the_summary_names_the_folders_such_that_they_are_found_again(place):

@@ -26,6 +26,7 @@ from lab.findings.finding import Level
 from lab.runs.process import process_run
 from lab.simulate.campaign import CampaignQuality, simulate_calibration
 from lab.simulate.write import simulate
+from tests.tables import rows_of
 
 DAY = datetime.date(2026, 3, 14)
 SMALL = CampaignQuality(dots=(5, 4))
@@ -94,8 +95,7 @@ def test_errors_of_poses_measured_with_the_calibrated_rig_agree_with_their_covar
     run = simulate("smooth", tmp_path / "run", seed=3, frames=12, points=True, noise_px=0.054, clutter=0.0)
     truth = load_rig(project / "truth" / "rig.yaml")
     true_poses = truth_poses(run)
-    with (run / "detections.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(run / "detections.csv")
     write_detections_of(truth, true_poses, run, rows[0].keys())
     file = load_rig_file(outcome.out / "rig.yaml")
     save_rig(dataclasses.replace(file, calibration=None), run / "rig.yaml")  # without the expiry date
@@ -110,8 +110,7 @@ def test_errors_of_poses_measured_with_the_calibrated_rig_agree_with_their_covar
 
 
 def truth_poses(run):
-    with (run / "truth" / "pose.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(run / "truth" / "pose.csv")
     q = np.array([[float(r[c]) for c in ("qw", "qx", "qy", "qz")] for r in rows])
     return Pose.from_quaternion(q, np.array([[float(r[c]) for c in ("x_m", "y_m", "z_m")] for r in rows]))
 
@@ -134,8 +133,7 @@ def write_detections_of(rig, poses, run, header):
 
 
 def test_the_table_of_residuals_has_a_row_per_number_with_its_unit(outcome):
-    with (outcome.out / "residuals.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(outcome.out / "residuals.csv")
     assert tuple(rows[0]) == COLUMNS
     kinds = {r["kind"] for r in rows}
     assert kinds == {"spot", "dot", "survey", "stand"}
@@ -261,8 +259,7 @@ def with_survey_columns(project, tmp_path, order):
     """A copy of the project whose survey has its coordinates in another order."""
     copy = tmp_path / "project"
     shutil.copytree(project, copy)
-    with open(copy / "survey.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(copy / "survey.csv")
     names = ("x_m", "y_m", "z_m")
     mixed = [{**row, **{n: row[names[k]] for n, k in zip(names, order, strict=True)}} for row in rows]
     with open(copy / "survey.csv", "w", newline="") as file:

@@ -7,9 +7,7 @@ import hashlib
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig_file, save_rig
@@ -18,6 +16,7 @@ from lab.files.text import columns
 from lab.results.certificate import CLOCKS, NOISE, PLACES, TURNS, certificate, write_certificate
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tests.command import typed
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +132,6 @@ def test_a_frame_that_is_not_measured_and_a_lost_run_folder_are_errors(results, 
         certificate(results, at=[999], draws=0)
     with pytest.raises(InputError, match=r"run\.yaml"):
         certificate(results, tmp_path, draws=0)
-    done = CliRunner().invoke(main, ["report", str(results), "--at", "3"])
+    done = typed("report", results, "--at", "3")
     assert done.exit_code == 2
     assert "--at is of the certificate" in done.output

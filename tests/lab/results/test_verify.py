@@ -7,13 +7,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from lab.errors import InputError
 from lab.files.run import fingerprints
 from lab.results.verify import difference_of, read_recorded, verify
 from lab.simulate.write import simulate
+from tests.command import typed
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "--set",
         "detect.threshold_sigma=6",
     ]
-    done = CliRunner().invoke(main, arguments)
+    done = typed(*arguments)
     assert done.exit_code == 0, done.output
     return folder
 
@@ -57,7 +56,7 @@ def test_a_causal_result_with_full_fingerprints_is_computed_without_smoothing(ma
     with monkeypatch.context() as m:
         m.setattr(fingerprints, "MAX_HASHED_BYTES", 100)
         m.setattr(fingerprints, "_of_file", lambda path, full: read.append(path) or of_file(path, full))
-        assert CliRunner().invoke(main, arguments).exit_code == 0
+        assert typed(*arguments).exit_code == 0
     inputs = json.loads((tmp_path / "out" / "summary.json").read_text())["inputs"]
     assert {entry["covers"] for entry in inputs} == {"contents"}
     assert sorted(map(str, read)) == sorted(entry["path"] for entry in inputs)  # each once

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import datetime
 
@@ -19,6 +18,7 @@ from lab.findings.finding import Level
 from lab.runs.batch.batch import process_batch
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tests.tables import rows_of
 
 DAY = datetime.date(2026, 3, 14)
 
@@ -53,8 +53,7 @@ def test_the_calibrations_covariance_is_in_its_own_table_and_in_the_total(run_fo
     # A principal point with a sigma of 1 px outweighs spots with a sigma of 0.1 px.
     variances, alone = (np.diagonal(p.covariance, axis1=1, axis2=2) for p in (poses, plain))
     assert np.all(variances > 2 * alone)
-    with (tmp_path / "with" / "systematic.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "with" / "systematic.csv")
     assert len(rows) == 10
     assert float(rows[0]["c00"]) == pytest.approx(poses.systematic[0, 0, 0])
     report = (tmp_path / "with" / "report.html").read_text()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from dataclasses import replace
 
@@ -29,6 +28,7 @@ from lab.setup.plan_findings import (
     worst_first,
 )
 from tests.geometry.scenes import LENSES, paper_rig
+from tests.tables import rows_of
 
 SMALL = PlanOptions(
     {
@@ -50,11 +50,6 @@ def over(**ranges):
 def rig_path(tmp_path):
     save_rig(paper_rig(LENSES[5], size_m=(4.0, 3.0)), tmp_path / "rig.yaml")
     return tmp_path / "rig.yaml"
-
-
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_a_plan_is_two_tables_and_a_page(rig_path, tmp_path):

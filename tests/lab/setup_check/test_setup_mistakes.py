@@ -14,14 +14,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from click.testing import CliRunner
 
 from bench import refine as bench
 from bench.mistakes.mistakes import CASES, read, turned_aside, write
 from bench.mistakes.recordings import calibrated
 from bench.random_scenes.scene import random_scene
 from bench.random_scenes.write_folder import write_run_folder
-from cli import main
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.forward_model import SpotModel
@@ -41,6 +39,7 @@ from lab.runs.process import process_run
 from lab.runs.setup_check import SampledFrames, compared_with_mistakes, frames_of
 from lab.simulate.scenarios import fan, unequal_fan
 from lab.simulate.write import simulate
+from tests.command import typed
 from tests.lab.run_folders import edit, write_run
 from tests.marks import further_slow
 from tracking.detections import Detections
@@ -516,7 +515,7 @@ def test_the_size_of_a_picture_shows_the_mistake(tmp_path, size, words):
     text, status = checked(run)
     assert status == 2
     assert words in text
-    processed = CliRunner().invoke(main, ["run", str(run), "--out", str(tmp_path / "out")])
+    processed = typed("run", run, "--out", tmp_path / "out")
     assert processed.exit_code == 4
     assert f"camera left has no usable picture at all (wrong size {size[0]}x{size[1]}," in processed.stdout
 

@@ -1,6 +1,5 @@
 """Simulated run folders agree with their scene."""
 
-import csv
 import itertools
 from dataclasses import replace
 
@@ -20,6 +19,7 @@ from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Light, Occlusion
 from lab.simulate.scene import compose
 from lab.simulate.write import simulate
 from tests.marks import further_slow
+from tests.tables import rows_of
 
 SMALL = {"scale": 0.25}
 
@@ -69,8 +69,7 @@ def test_faults_are_in_the_frames_of_the_scenario(tmp_path):
     assert cut[-12:] != whole[-12:]  # a PNG ends with its IEND chunk
     assert len(cut) < 0.7 * len(whole)
     assert cv2.imread(str(folder / "frames" / "left" / "000055.png"), -1).shape == (128, 160)
-    with (folder / "truth" / "spots.csv").open() as file:
-        assert {int(row["frame"]) for row in csv.DictReader(file)} == set(range(57))
+    assert {int(row["frame"]) for row in rows_of(folder / "truth" / "spots.csv")} == set(range(57))
 
 
 def test_a_video_contains_the_pictures_without_loss(tmp_path):

@@ -21,6 +21,7 @@ from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
 from tests.marks import further_slow
+from tests.tables import rows_of
 from tracking.smoothing.motion.clocks import DETERMINED
 from tracking.smoothing.motion.interpolation import Interpolation
 from tracking.smoothing.smoother import _Smoother
@@ -80,8 +81,7 @@ def test_without_the_clocks_the_same_recording_fails(recording, tmp_path):
 
 
 def test_detections_have_the_pictures_own_numbers_and_instants(results):
-    with (results / "detections.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(results / "detections.csv")
     assert list(rows[0])[-1] == "t_s"
     late = {int(r["frame"]): float(r["t_s"]) for r in rows if r["camera"] == "right"}
     assert sorted(late) == list(range(FRAMES))
