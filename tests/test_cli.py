@@ -31,9 +31,9 @@ from lab.runs.batch import task as batch
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
 from tests.paths import ROOT
-from tests.tables import rows_of
 
 SAMPLE = ROOT / "sample_runs" / "huo2015"
 PICTURES = 12  # of each camera of the sample run, enough for every file of a result; `-m slow` takes all 220

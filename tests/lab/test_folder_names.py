@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from lab.simulate.write import simulate
-from tests.command import typed
+from tests.lab.command import typed
 from tests.paths import ROOT
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")

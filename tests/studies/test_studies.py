@@ -7,7 +7,7 @@ import pytest
 
 from studies.comparison import write_comparison
 from studies.huo2015 import NOISE_PX, comparison_of, prediction_errors, repeat_huo2015
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 
 FRAMES = 200  # a bend, and spots 3 and 6 leave the picture
 

@@ -44,7 +44,7 @@ from lab.files.text.yaml_text import write_mapping
 from lab.findings.finding import Level
 from lab.simulate.scenarios import RIGS
 from tests.calibration.beams.bench import ARCSEC, WORLD_FROM_STAND, drawn, errors, positions, recorded
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 
 STAND = {
     "world_from_stand": {

@@ -22,9 +22,9 @@ from lab.calibrate.camera.camera import (
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.camera_file import load_camera
 from lab.findings.finding import Level
-from tests.command import typed
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.paths import DATA
-from tests.tables import rows_of
 
 STEREO = DATA / "chessboard_stereo_opencv"
 BOARD = "chessboard:9x6:25mm"

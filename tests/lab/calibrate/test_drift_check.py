@@ -25,7 +25,7 @@ from lab.files.rig.camera_file import CalibrationState
 from lab.files.rig.rig_file import joint_covariance
 from lab.findings.finding import Level
 from tests.lab.calibrate import drift_scenes as scenes
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 
 RIG, COVARIANCE = scenes.rig_and_covariance()
 TRUE = scenes.true_rig(RIG, COVARIANCE, np.random.default_rng(1))

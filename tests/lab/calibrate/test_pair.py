@@ -20,8 +20,8 @@ from lab.files.rig.pair_file import load_pair_file
 from lab.findings.finding import Level, verdict
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.calibration.lens.lens_scenes import Scene, photographs
-from tests.command import typed
-from tests.tables import rows_of
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 
 NAMES = ("left", "right")
 

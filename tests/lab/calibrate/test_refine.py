@@ -28,9 +28,9 @@ from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance,
 from lab.files.run.run_file import load_run
 from lab.findings.finding import Level
 from lab.simulate.write import simulate
-from tests.command import typed
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
-from tests.tables import rows_of
 from tracking.setup_mistakes import evidence
 
 SIGMAS = {

@@ -26,7 +26,7 @@ from lab.findings.finding import Level
 from lab.runs.process import process_run
 from lab.simulate.campaign import CampaignQuality, simulate_calibration
 from lab.simulate.write import simulate
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 
 DAY = datetime.date(2026, 3, 14)
 SMALL = CampaignQuality(dots=(5, 4))

@@ -28,9 +28,9 @@ from lab.findings.finding import Level
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.lab.calibrate.screen_projects import truth, write_project
 from tests.lab.files.test_project import TARGET, changed
+from tests.lab.tables import rows_of
 from tests.marks import needs_open3d
 from tests.paths import DATA
-from tests.tables import rows_of
 
 BOARD = Charuco(8, 6, 0.15, 0.11, "DICT_4X4_50")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lab.simulate.write import simulate
-from tests.command import typed
+from tests.lab.command import typed
 
 DAYS = ("2026-03-02", "2026-03-03", "2026-03-05", "2026-03-09", None)
 

@@ -16,7 +16,7 @@ from lab.files.text import columns
 from lab.results.certificate import CLOCKS, NOISE, PLACES, TURNS, certificate, write_certificate
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
-from tests.command import typed
+from tests.lab.command import typed
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from lab.files.text import columns
 from lab.files.text.csv_text import write_table
 from lab.packages import PACKAGES
 from lab.results.export import FORMATS
-from tests.command import typed
+from tests.lab.command import typed
 from tests.paths import ROOT
 
 # world_from_body by axis and angle (deg), place (m) and status of each frame; frame 4 is missing, 6 has no pose.

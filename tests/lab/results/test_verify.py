@@ -12,7 +12,7 @@ from lab.errors import InputError
 from lab.files.run import fingerprints
 from lab.results.verify import difference_of, read_recorded, verify
 from lab.simulate.write import simulate
-from tests.command import typed
+from tests.lab.command import typed
 
 
 @pytest.fixture(scope="module")

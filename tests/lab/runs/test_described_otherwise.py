@@ -16,7 +16,7 @@ from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 
 FRAMES = 30
 HERE = Pose.identity()

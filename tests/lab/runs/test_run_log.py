@@ -10,7 +10,7 @@ import pytest
 
 from lab.runs.run_log import LOGGER, RunLog, listening
 from lab.simulate.write import simulate
-from tests.command import typed
+from tests.lab.command import typed
 from tests.lab.run_folders import write_run
 
 LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (INFO|WARNING|ERROR) +(.+)")

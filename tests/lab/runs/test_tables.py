@@ -17,7 +17,7 @@ from lab.files.text import columns
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.tables import TableWriter, csv_word, pose_numbers
 from tests.geometry.scenes import paper_rig, random_pose
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 from tracking.detections import Detections
 from tracking.statuses import MotionEstimate, PoseStatus, SpotStatus, TrackedFrame
 

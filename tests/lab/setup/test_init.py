@@ -14,7 +14,7 @@ from lab.files.rig.rig_file import load_rig
 from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.setup.init import Layout, rig_of, start
-from tests.command import typed
+from tests.lab.command import typed
 from tests.marks import further_slow
 
 LAYOUTS = [

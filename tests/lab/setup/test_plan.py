@@ -28,7 +28,7 @@ from lab.setup.plan_findings import (
     worst_first,
 )
 from tests.geometry.scenes import LENSES, paper_rig
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 
 SMALL = PlanOptions(
     {

@@ -39,7 +39,7 @@ from lab.runs.process import process_run
 from lab.runs.setup_check import SampledFrames, compared_with_mistakes, frames_of
 from lab.simulate.scenarios import fan, unequal_fan
 from lab.simulate.write import simulate
-from tests.command import typed
+from tests.lab.command import typed
 from tests.lab.run_folders import edit, write_run
 from tests.marks import further_slow
 from tracking.detections import Detections

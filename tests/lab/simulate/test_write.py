@@ -18,8 +18,8 @@ from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Light, Occlusion
 from lab.simulate.scene import compose
 from lab.simulate.write import simulate
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
-from tests.tables import rows_of
 
 SMALL = {"scale": 0.25}
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.command import typed
+from tests.lab.command import typed
 
 SIZE, FRAMES = (320, 240), 40
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lab.findings.finding import Level, finding
-from tests.command import typed
-from tests.tables import rows_of
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.tracking.drogue_circle.discs import discs
 
 SIZE = (128, 96)

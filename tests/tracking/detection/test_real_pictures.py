@@ -12,8 +12,8 @@ import pytest
 
 from bench.real_spots import measured
 from lab.runs.detect.detect import DetectOptions, detect_pictures
+from tests.lab.tables import rows_of
 from tests.paths import DATA
-from tests.tables import rows_of
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
 from tracking.noise import Picture

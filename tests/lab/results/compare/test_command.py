@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.command import typed
+from tests.lab.command import typed
 from tests.lab.results.compare.test_compare import SIMPLE, write_results, write_tum
 from tests.tracking.comparison.motions import recordings
 

@@ -17,7 +17,7 @@ from lab.files.run.results import SUMMARY_SCHEMA
 from lab.files.text import columns
 from lab.results.compare import UNDETERMINED, _still, alignment_rows, compare, read_reference
 from lab.results.compare_page import DIFFERENCES, compare_and_write
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 from tests.tracking.comparison.motions import TRUTH, recordings, smooth
 from tracking.comparison.frame_alignment import PoseSeries
 

@@ -20,7 +20,7 @@ from lab.report.plot.svg import SPOT_COLOURS
 from lab.results.show import show_frame, write_picture, write_video
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
-from tests.command import typed
+from tests.lab.command import typed
 from tests.lab.fake_results import make
 from tracking.statuses import PoseStatus, SpotStatus
 

@@ -19,9 +19,9 @@ from lab.runs.batch import task as module
 from lab.runs.batch.batch import BatchOptions, process_batch, read_rows
 from lab.runs.batch.task import COLUMNS
 from lab.simulate.write import simulate
-from tests.command import typed
+from tests.lab.command import typed
 from tests.lab.run_folders import write_run
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 
 
 def points_run(folder: Path, seed: int = 5) -> Path:

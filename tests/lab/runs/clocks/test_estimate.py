@@ -16,8 +16,8 @@ from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.results.certificate import CLOCKS, certificate
 from lab.runs.frames.frames import FoundPoints
 from lab.simulate.write import simulate
-from tests.command import typed
-from tests.tables import rows_of
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tracking.detections import Detections
 
 FRAMES, SEED = 80, 3

@@ -20,8 +20,8 @@ from geometry.pose import Pose
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
-from tests.tables import rows_of
 from tracking.smoothing.motion.clocks import DETERMINED
 from tracking.smoothing.motion.interpolation import Interpolation
 from tracking.smoothing.smoother import _Smoother

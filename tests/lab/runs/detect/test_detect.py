@@ -15,7 +15,7 @@ from lab.files.text import columns
 from lab.runs.detect.detect import SHEET, DetectOptions, detect_pictures
 from lab.runs.detect.detect_page import MOST, ContactSheet
 from lab.runs.detect.picture_series import MOST_KEPT, SpotCollection, laser_likeness, matched_snr
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 from tests.tracking.rendering import Scene, Spot, expected
 from tracking.detections import Detections
 

@@ -22,7 +22,7 @@ from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.files.rig.rig_file import load_rig
 from lab.pictures.delivery import without_repeats
-from tests.command import typed
+from tests.lab.command import typed
 from tests.marks import further_slow
 from tests.tracking.rendering import round_lights
 from tracking.background.camera_motion import CameraMotion, shift_between

@@ -15,7 +15,7 @@ from geometry.camera import Camera
 from geometry.planes import intersect_plane
 from geometry.rig import Screen
 from lab.files.rig.rig_file import load_rig
-from tests.command import typed
+from tests.lab.command import typed
 from tests.marks import further_slow
 
 SIZE, FRAMES, WIDE_PX = (512, 640), 30, 38.0

@@ -20,7 +20,7 @@ from lab.runs.watch.live_output import LIVE_TABLE
 from lab.runs.watch.watch import watch_run
 from lab.simulate.write import simulate
 from tests.lab.runs.watch.test_watch import run_of_first_pictures
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 from tracking.detections import Detections
 
 FRAMES, EVERY = 24, 2

@@ -31,8 +31,8 @@ from lab.runs.frames.frames import open_frames
 from lab.runs.watch import record as recording
 from lab.runs.watch.cameras import FrameClock
 from lab.runs.watch.record import RecordOptions, record
+from tests.lab.tables import rows_of
 from tests.paths import ROOT
-from tests.tables import rows_of
 
 SIZE = (160, 128)  # of the rig's cameras
 PROGRAM = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cli import main; main(prog_name='beampose')"

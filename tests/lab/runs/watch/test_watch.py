@@ -32,7 +32,7 @@ from lab.runs.watch.live_output import LIVE_TABLE, Latency
 from lab.runs.watch.watch import watch_run
 from lab.simulate.scenarios import SCENARIOS, Light
 from lab.simulate.write import simulate
-from tests.tables import rows_of
+from tests.lab.tables import rows_of
 from tracking.detections import Detections
 
 FRAMES = 24

@@ -13,8 +13,8 @@ import pytest
 from cli import main
 from lab.targets.circle import CIRCLE, DETECTORS, FORMS, CircleOptions, CircleTarget
 from lab.targets.track import track_target
-from tests.command import typed
-from tests.tables import rows_of
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.tracking.drogue_circle.discs import discs
 
 SIZE = (128, 96)

@@ -16,8 +16,8 @@ from lab.targets.drogue import DROGUE, DrogueOptions, DrogueTarget
 from lab.targets.track import track_target
 from studies.drogue.render import render_drogue
 from studies.drogue.scene import PICTURE, SKY, DrogueBackground, DrogueScene
-from tests.command import typed
-from tests.tables import rows_of
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 
 SIZE, FOCAL = (224, 160), 400.0
 

@@ -12,8 +12,8 @@ from lab.findings.finding import Level, verdict
 from lab.targets.point import COLUMNS, PointOptions, PointTarget
 from lab.targets.track import track_target
 from studies.duan2020 import compare_duan2020
-from tests.command import typed
-from tests.tables import rows_of
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 
 FRAMES = 30
 

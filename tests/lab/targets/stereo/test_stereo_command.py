@@ -17,9 +17,9 @@ from lab.findings.finding import Verdict
 from lab.number_format import decimals_of
 from lab.targets.stereo.process import findings_of, process_stereo_run
 from lab.targets.stereo.simulated_recording import write_stereo_recording
-from tests.command import typed
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
-from tests.tables import rows_of
 
 FRAMES = 12  # of the recording of points
 

@@ -14,9 +14,9 @@ from geometry.pose import Pose
 from lab.report.page import PageDrawing
 from lab.report.plot.series import Band
 from lab.targets.stereo.page import pose_section
-from tests.command import typed
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
-from tests.tables import rows_of
 from tracking.binocular.pose_tracker import BinocularFrame
 from tracking.statuses import PoseStatus
 
