@@ -24,7 +24,7 @@ INDEX_READS = ("attitude.csv", "summary.json")
 
 def report_bytes(frames: int, seed: int, work: Path) -> int:
     """Size of the report of a simulated recording."""
-    run = simulate(SCENARIO, work / f"run-{frames}", seed=seed, frames=frames, detections_only=True)
+    run = simulate(SCENARIO, work / f"run-{frames}", seed=seed, frames=frames, points=True)
     process_run(run, work / f"out-{frames}")
     return (work / f"out-{frames}" / "report.html").stat().st_size
 
@@ -32,7 +32,7 @@ def report_bytes(frames: int, seed: int, work: Path) -> int:
 def index_bytes(runs: int, seed: int, work: Path) -> int:
     """Size of the index of a batch of so many runs."""
     folders = [
-        simulate(SCENARIO, work / f"run-of-day-{k:04d}", seed=seed + k, frames=300, detections_only=True)
+        simulate(SCENARIO, work / f"run-of-day-{k:04d}", seed=seed + k, frames=300, points=True)
         for k in range(min(PROCESSED, runs))
     ]
     process_batch(folders, work / "batch")

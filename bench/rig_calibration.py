@@ -235,7 +235,7 @@ def recorded(seed: int, noise_px: float, work: Path) -> str:
     true, known = written(c.truth, None, work / "true.yaml"), written(joint.rig, joint.covariance, work / "known.yaml")
     folders = [
         simulate(
-            "small-motion", work / name, seed=seed, frames=FRAMES, detections_only=True, noise_px=noise_px, rig=true,
+            "small-motion", work / name, seed=seed, frames=FRAMES, points=True, noise_px=noise_px, rig=true,
             known_rig=given,
         )
         for name, given in (("exact", true), ("calibrated", known))

@@ -15,7 +15,7 @@ _PLACES = {
     "AnnotatedPicture": "lab.api.results",
     "export": "lab.results.export",
     "process": "lab.api.results",
-    "simulate_run": "lab.api.results",
+    "simulate_run": "lab.simulate.write",
     "scenarios": "lab.api.results",
     "find_spots": "lab.api.tracking",
     "track": "lab.api.tracking",

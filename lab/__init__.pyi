@@ -3,7 +3,6 @@ from lab.api.results import Results as Results
 from lab.api.results import load as load
 from lab.api.results import process as process
 from lab.api.results import scenarios as scenarios
-from lab.api.results import simulate_run as simulate_run
 from lab.api.tracking import Tracker as Tracker
 from lab.api.tracking import find_spots as find_spots
 from lab.api.tracking import track as track
@@ -12,3 +11,4 @@ from lab.errors import CalibrationError as CalibrationError
 from lab.errors import InputError as InputError
 from lab.errors import RunError as RunError
 from lab.results.export import export as export
+from lab.simulate.write import simulate_run as simulate_run

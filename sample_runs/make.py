@@ -19,13 +19,13 @@ from lab.simulate.write import simulate
 # the light "lab" is thirty times as large, so of that kind there are few, and at half the size.
 SAMPLES: dict[str, dict[str, Any]] = {
     "huo2015": {"scenario": "huo2015", "seed": 19, "frames": 220, "light": "quiet"},
-    "sharp-turns": {"scenario": "sharp-turns", "seed": 1, "frames": 30, "picture_scale": 0.5},
-    "damaged": {"scenario": "damaged", "seed": 2, "frames": 80, "light": "quiet", "picture_scale": 0.5},
+    "sharp-turns": {"scenario": "sharp-turns", "seed": 1, "frames": 30, "scale": 0.5},
+    "damaged": {"scenario": "damaged", "seed": 2, "frames": 80, "light": "quiet", "scale": 0.5},
     "turntable-video": {
-        "scenario": "turntable", "seed": 3, "frames": 240, "light": "quiet", "picture_scale": 0.5, "video": True,
+        "scenario": "turntable", "seed": 3, "frames": 240, "light": "quiet", "scale": 0.5, "video": True,
     },
-    "four-skew-beams": {"scenario": "four-skew-beams", "seed": 4, "frames": 300, "detections_only": True},
-    "calibrated": {"scenario": "huo2015", "seed": 6, "frames": 300, "detections_only": True},
+    "four-skew-beams": {"scenario": "four-skew-beams", "seed": 4, "frames": 300, "points": True},
+    "calibrated": {"scenario": "huo2015", "seed": 6, "frames": 300, "points": True},
 }  # fmt: skip
 CALIBRATION, CALIBRATION_SEED = "calibration", 6  # the campaign; the run `calibrated` is of its true rig
 HERE = Path(__file__).resolve().parent
@@ -36,13 +36,13 @@ def make(name: str, folder: Path) -> Path:
     if name == CALIBRATION:
         return simulate_calibration(folder, seed=CALIBRATION_SEED)
     if name != "calibrated":
-        return simulate(out_folder=folder, **SAMPLES[name])
+        return simulate(out=folder, **SAMPLES[name])
     # A recording of the rig as it truly is, given what the calibration knows of it.
     with tempfile.TemporaryDirectory() as work:
         campaign = HERE / CALIBRATION
         calibrate_rig(campaign / PROJECT, Path(work) / "rig")
         known = Path(work) / "rig" / RIG
-        return simulate(out_folder=folder, rig=campaign / "truth" / RIG, known_rig=known, **SAMPLES[name])
+        return simulate(out=folder, rig=campaign / "truth" / RIG, known_rig=known, **SAMPLES[name])
 
 
 def main() -> None:

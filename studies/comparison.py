@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from markupsafe import Markup
-
-from lab.files.text.atomic_write import atomic_folder, atomic_write_text, earlier_results
+from lab.files.text.atomic_write import atomic_folder, earlier_results
 from lab.files.text.csv_text import write_table
 from lab.findings.finding import Done
-from lab.report.page import environment
+from lab.report.page import Page, PageTable, Section, made_with, write_page
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,15 +20,6 @@ class ComparisonRow:
     paper: float | None
     values: tuple[float | None, ...]
     note: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """A section of the page: heading, a paragraph, and drawings (SVG of lab/report/plot)."""
-
-    title: str
-    words: str
-    drawing: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +35,7 @@ class Comparison:
     methods: tuple[str, ...]
     rows: tuple[ComparisonRow, ...]
     explanation: str
-    figures: tuple[Figure, ...]
+    figures: tuple[Section, ...]
     source: str
 
     def value(self, quantity: str, method: str) -> float | None:
@@ -70,7 +59,7 @@ def write_comparison(comparison: Comparison, out: Path) -> Done[Path]:
         cells = [[row.quantity, row.unit, row.paper, *row.values, row.note] for row in comparison.rows]
         rows = [["" if v is None else f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in cells]
         write_table(work / "figures.csv", columns(comparison), rows)
-        atomic_write_text(_page(comparison), work / "report.html")
+        write_page(_page(comparison), work)
     lines = tuple(_line(comparison, row) for row in comparison.rows)
     return Done(out, (*lines, f"table: {out / 'figures.csv'}", f"report: {out / 'report.html'}"))
 
@@ -81,11 +70,10 @@ def _line(comparison: Comparison, row: ComparisonRow) -> str:
     return f"{row.quantity}{unit}: " + ", ".join(f"{name} {'-' if v is None else f'{v:.4g}'}" for name, v in values)
 
 
-def _page(comparison: Comparison) -> str:
-    rows = [(r.quantity, r.unit, *(_shown(v) for v in (r.paper, *r.values)), r.note) for r in comparison.rows]
-    figures = [(figure.title, figure.words, Markup(figure.drawing)) for figure in comparison.figures]
-    return environment().get_template("study.html.j2").render(study=comparison, rows=rows, figures=figures)
-
-
-def _shown(value: float | None) -> str:
-    return "–" if value is None else "0" if abs(value) < 1e-9 else f"{value:.3g}" if value < 1e-2 else f"{value:.4g}"
+def _page(comparison: Comparison) -> Page:
+    rows = [(r.quantity, r.unit, r.paper, *r.values, r.note) for r in comparison.rows]
+    table = PageTable(("quantity", "unit", "paper", *comparison.methods, "note"), rows)
+    figures = Section("Comparison with the published figures", comparison.explanation, table=table)
+    maker, source = "reproduction of a published experiment", f"Source: {comparison.source}"
+    sections = [figures, *comparison.figures]
+    return Page(maker, comparison.title, comparison.setting, sections, notes=[source], made=[made_with()])

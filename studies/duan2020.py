@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geometry.arrays import Array, Bools
+from lab.report.page import Section
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION
-from studies.comparison import Comparison, ComparisonRow, Figure
+from studies.comparison import Comparison, ComparisonRow
 from tracking import kalman
 from tracking.detections import Detections
 from tracking.single_target.point_tracker import PointParameters, track_point
@@ -203,7 +204,7 @@ def _largest(error: Array, where: Bools) -> float:
     return float(values.max()) if values.size else float("nan")
 
 
-def _curves(seed: int) -> tuple[Figure, ...]:
+def _curves(seed: int) -> tuple[Section, ...]:
     out = []
     for clutter in (False, True):
         scene = simulate(seed, 0, clutter)
@@ -218,7 +219,7 @@ def _curves(seed: int) -> tuple[Figure, ...]:
                 time_panel(frames, title, "px", lines=lines, shades=shades, y_range=(-8.0, 8.0), time_name="frame")
             )
         out.append(
-            Figure(
+            Section(
                 f"Errors {'with' if clutter else 'without'} false detections",
                 "Green: detections. Orange: as printed. Blue: corrected. Red: beampose. Yellow: hidden; blue: the turn."
                 + (
@@ -226,7 +227,7 @@ def _curves(seed: int) -> tuple[Figure, ...]:
                     if clutter
                     else " The printed covariance is not symmetric and its gain is wrong after a hidden interval."
                 ),
-                "".join(panels),
+                panels,
             )
         )
     return tuple(out)

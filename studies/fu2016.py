@@ -13,11 +13,11 @@ from geometry.arrays import Array, Bools
 from geometry.camera import Camera
 from geometry.pose import Pose
 from geometry.rotations import ypr_jacobian
-from lab.number_format import format_number
+from lab.report.page import PageTable, Section
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, ORANGE, VERMILLION, picture_uri, robust_range
 from lab.targets.stereo.lamps import spots
-from studies.comparison import Comparison, ComparisonRow, Figure
+from studies.comparison import Comparison, ComparisonRow
 from tracking.binocular.lamp_tracker import LampFrame, LampTracker, harris_corners
 from tracking.binocular.marker_model import MarkerModel
 from tracking.statuses import PoseStatus
@@ -349,7 +349,7 @@ def picture_rows(runs: dict[str, PictureRun]) -> list[ComparisonRow]:
     return out
 
 
-def picture_figure(seed: int, run: PictureRun) -> Figure:
+def picture_figure(seed: int, run: PictureRun) -> Section:
     """A clear and a disturbed picture with corners and lamps, and the errors over time."""
     panels = [_shown(seed, False), _shown(seed, True)]
     shade = (Shade(run.gust, "predicted", "disturbed"),)
@@ -361,12 +361,12 @@ def picture_figure(seed: int, run: PictureRun) -> Figure:
         panels.append(
             time_panel(run.t_s, f"{title}: estimate − true", "m", lines=lines, shades=shade, y_range=(-0.1, 0.1))
         )
-    return Figure(
+    return Section(
         "Pose from pictures: Harris corners and RANSAC (Figs. 2 and 3)",
         "Rendered pictures of a tanker with two lamps on the wing and three on the fuselage, 640 x 512 pixels, f = 500"
         " px. Circles: corners; squares: those that are lamps. Left: clear. Right: disturbed. Below:"
         " orange: pose of each picture; red: Student-t filter. Pictures without a safe pose have no orange value.",
-        "".join(panels),
+        panels,
     )
 
 
@@ -499,7 +499,7 @@ def _observability_rows(observed: dict[str, Observability]) -> list[ComparisonRo
 # The figures ------------------------------------------------------------------------------------------------------
 
 
-def _curves(seed: int) -> list[Figure]:
+def _curves(seed: int) -> list[Section]:
     out = []
     for disturbance in DISTURBANCES[1:]:
         recording = simulate(seed, 0, disturbance)
@@ -507,12 +507,12 @@ def _curves(seed: int) -> list[Figure]:
         shown = ((1, "y", "m"), (2, "z", "m"), (4, "velocity y", "m/s"), (6, "yaw", "deg"))
         panels = [_panel(recording, states, column, f"{name}: estimate − true", unit) for column, name, unit in shown]
         out.append(
-            Figure(
+            Section(
                 f"Errors with a {disturbance} (Figs. 4 to 8)",
                 "Blue: standard. Orange: as printed. Green: gate. Red: Student-t. The disturbance is shaded. The"
                 " modification as printed keeps its previous value whenever a number changes by more than 0.5 %, so it"
                 " does not follow the motion; the gate can stay closed after the disturbance.",
-                "".join(panels),
+                panels,
             )
         )
     return out
@@ -528,21 +528,20 @@ def _panel(recording: Recording, states: dict[str, Array], column: int, title: s
     return time_panel(recording.t_s[t], title, unit, lines=lines, shades=shade, y_range=y_range)
 
 
-def _observability_figure(observed: dict[str, Observability]) -> Figure:
-    head = "".join(f"<th>{name}</th>" for name in ("state", "prior", *(n.partition(":")[0] for n in observed)))
+def _observability_figure(observed: dict[str, Observability]) -> Section:
+    heads = ("state", "prior", *(n.partition(":")[0] for n in observed))
     units = ("m", "m", "m", "m/s", "m/s", "m/s", "rad", "rad")
-    rows = []
-    for i, (state, unit) in enumerate(zip(STATES, units, strict=True)):
-        sigmas = [next(iter(observed.values())).sigma_prior[i], *(o.sigma[i] for o in observed.values())]
-        cells = "".join(f"<td>{format_number(float(s), 2)}</td>" for s in sigmas)
-        rows.append(f"<tr><td>{state} ({unit})</td>{cells}</tr>")
-    ranks = "".join(f"<td>{o.rank} of {len(STATES)}</td>" for o in observed.values())
-    rows.append(f"<tr><td>directions observed</td><td></td>{ranks}</tr>")
-    return Figure(
+    prior = next(iter(observed.values())).sigma_prior
+    rows: list[list[object]] = [
+        [f"{state} ({unit})", prior[i], *(o.sigma[i] for o in observed.values())]
+        for i, (state, unit) in enumerate(zip(STATES, units, strict=True))
+    ]
+    rows.append(["directions observed", "", *(f"{o.rank} of {len(STATES)}" for o in observed.values())])
+    return Section(
         "Which states are observable",
         "Sigma of each number of the first state, before and after 20 s of measurements, without process noise, from"
         " the observability Gramian along the true motion. Eq. (4) selects four numbers: range and range rate keep"
         " their prior sigma. Eq. (5) replaces the two attitude angles by the directions in which the tanker is seen:"
         " they observe the range weakly, through the parallax y / x, and the attitude not at all.",
-        f'<table class="facts"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>',
+        table=PageTable(heads, rows),
     )

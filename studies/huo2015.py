@@ -12,10 +12,11 @@ from geometry.arrays import Array, Bools
 from geometry.pose import Pose
 from geometry.pose_prior import PosePrior
 from geometry.pose_solver.gauss_newton import fit_pose
+from lab.report.page import Section
 from lab.report.plot import svg
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.simulate.points import PointRun, simulate_points
-from studies.comparison import Comparison, ComparisonRow, Figure
+from studies.comparison import Comparison, ComparisonRow
 from tracking import kalman
 from tracking.curve_switching.out_of_view import CoplanarViews, quadratic_positions
 from tracking.curve_switching.spot_tracker import SpotTracker
@@ -307,7 +308,7 @@ def comparison_of(study: Study) -> Comparison:
     )
 
 
-def _figures(study: Study) -> list[Figure]:
+def _figures(study: Study) -> list[Section]:
     t, n = study.run.t_s, study.run.model
     shade = (Shade(study.bends, "predicted", "the trajectory bends"),)
     out = []
@@ -320,12 +321,12 @@ def _figures(study: Study) -> list[Figure]:
             for kind, e in zip(("conventional", "curve switching"), errors, strict=True)
         ]
         out.append(
-            Figure(
+            Section(
                 f"Prediction by the conventional and the curve-switching filter, {name} (Figs. 5 and 6)",
                 "Blue: x; orange: y. Both filters get the same noisy positions. After a bend the conventional filter"
                 " needs many frames to converge if its process noise is small; with a large process noise"
                 " switching has little effect.",
-                "".join(panels),
+                panels,
             )
         )
     panels = []
@@ -340,19 +341,19 @@ def _figures(study: Study) -> list[Figure]:
             time_panel(t, f"spot {spot}: distance from truth, {study.run.noise_px:g} px noise", "px", lines=lines)
         )
     out.append(
-        Figure(
+        Section(
             "Spots out of view (Figs. 7 and 12)",
             "Solved from the other spots by the paper's quadratic equation (orange), and from the pose of all visible"
             " spots (blue). Without noise both are exact to rounding; the published 0.05 px corresponds to an input"
             " noise of about 0.004 px.",
-            "".join(panels),
+            panels,
         )
     )
     out.append(
-        Figure(
+        Section(
             "Trajectories (Fig. 8)",
             "As tracked by beampose. The rectangle is the edge of the picture; positions outside are solved.",
-            "".join(_tracks(study, c) for c in range(len(n.camera_names))),
+            [_tracks(study, c) for c in range(len(n.camera_names))],
         )
     )
     panels = []
@@ -361,10 +362,10 @@ def _figures(study: Study) -> list[Figure]:
         outside = (Shade(study.run.in_view[:, i] == 0, "outside", "out of view"),)
         panels.append(_panel(t, f"spot {spot} ({camera}): estimate − true", e, outside, svg.robust_range(e, 0.5)))
     out.append(
-        Figure(
+        Section(
             "Tracking error (Figs. 9 and 13)",
             "Blue: x; orange: y. Measured in view, solved out of view (shaded).",
-            "".join(panels),
+            panels,
         )
     )
     return out

@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.pose import Pose
+from lab.report.page import Section
 from lab.report.plot.series import Line, Shade, time_panel
 from lab.report.plot.svg import BLUE, GREEN, VERMILLION, axes, frame, line_path, plot_area, svg_of, text
 from lab.targets.circle import CircleOptions
-from studies.comparison import Comparison, ComparisonRow, Figure
+from studies.comparison import Comparison, ComparisonRow
 from studies.drogue.render import render_drogue, rim_of
 from studies.drogue.scene import LIGHTS, DrogueBackground, DrogueScene, Occluder, ellipse_through
 from tracking.drogue_circle.detectors import CircleCandidate, CircleParameters, Window, classical_detector
@@ -419,18 +420,18 @@ def compare_zhou2014(seed: int = 1, stills: int = STILLS, runs: int = RUNS, fram
         " filters. All get the same pictures. The paper's own pictures are not published: its column is its table 1,"
         " measured on a cart; ours are rendered.",
         figures=(
-            Figure(
+            Section(
                 "Errors of the centre",
                 f"Stills with a radius of {RADII_PX[0]:g} to {RADII_PX[1]:g} px, up to {100 * HIDDEN[-1]:g} % of the"
                 f" rim hidden on one side, blur of {BLUR_PX[0]:g} to {BLUR_PX[1]:g} px and noise of {NOISE_DN[0]:g} to"
                 f" {NOISE_DN[1]:g} DN.",
-                _distribution(errors),
+                [_distribution(errors)],
             ),
-            Figure(
+            Section(
                 "Eight fully hidden frames",
                 "Error of the reported centre. Shaded: the target is hidden. As printed, a clear target is not filtered"
                 " (R = 0), so that the rates have the noise of whole pixels and the prediction leaves the target.",
-                "".join(_hidden_panel(run, k) for k, run in enumerate(hidden[:2])),
+                [_hidden_panel(run, k) for k, run in enumerate(hidden[:2])],
             ),
         ),
         source="X. Zhou, X. Sun, Y. Bing, B. Yang, Journal of Data Acquisition and Processing 29(6), 1041 (2014), in"

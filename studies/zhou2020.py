@@ -11,9 +11,10 @@ from geometry.arrays import Array
 from geometry.pose import Pose
 from geometry.pose_solver.gauss_newton import PoseFit
 from geometry.rotations import ypr_from_matrix
+from lab.report.page import Section
 from lab.report.plot import svg
 from lab.targets.stereo.simulated_recording import drogue_markers, occluded, render, scene, simulated_pair, true_pixels
-from studies.comparison import Comparison, ComparisonRow, Figure
+from studies.comparison import Comparison, ComparisonRow
 from studies.learned_detector.samples import draw_sample
 from tracking.binocular.acquisition import mirrored
 from tracking.binocular.joint_fit import (
@@ -201,7 +202,7 @@ def compare_zhou2020(seed: int = 1, trials: int = TRIALS) -> Comparison:
         " contours. Single points: the most likely place of each marker. Joint fit: the pose that explains all markers"
         " in both pictures. The paper's column is the mean error of its two markers in table 3, which grows by 0.6 to"
         " 1.0 % of the distance: an error of its calibration, not noise.",
-        figures=(Figure(*_figure(distances)),),
+        figures=(_figure(distances),),
         source="Zhou Q., Xu Y., Jia E., Navigation Positioning and Timing 7(1), 40 (2020),"
         " doi 10.19306/j.cnki.2095-8110.2020.01.006.",
     )
@@ -275,7 +276,7 @@ def _angle_rows() -> list[ComparisonRow]:
     ]
 
 
-def _figure(distances: list[DistanceErrors]) -> tuple[str, str, str]:
+def _figure(distances: list[DistanceErrors]) -> Section:
     d = np.array([e.distance_m for e in distances])
     paper = np.array([(one + two) / 2 - true for true, one, two in TABLE_3])
     rms, bound = np.array([e.rms for e in distances]), np.array([e.bound for e in distances])
@@ -303,4 +304,4 @@ def _figure(distances: list[DistanceErrors]) -> tuple[str, str, str]:
         "The paper's errors (mean of two markers), the RMS errors of single points and of the joint fit, and the"
         " smallest possible RMS from the same information."
     )
-    return "Distances (table 3)", words, drawing
+    return Section("Distances (table 3)", words, [drawing])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 import os
@@ -32,6 +31,7 @@ from lab.runs.batch import task as batch
 from lab.simulate.scenarios import SCENARIOS
 from lab.simulate.write import simulate
 from tests.lab.run_folders import write_run
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
 from tests.paths import ROOT
 
@@ -227,8 +227,7 @@ def test_the_example_of_batch_has_a_row_for_every_run_and_an_index(desk, works):
     arguments = example("batch")
     works(*arguments)
     out = desk / arguments[-1]
-    with (out / "batch.csv").open() as table:
-        assert len(list(csv.DictReader(table))) == len(arguments) - 3
+    assert len(rows_of(out / "batch.csv")) == len(arguments) - 3
     assert (out / "index.html").is_file()
 
 
@@ -334,7 +333,7 @@ def test_the_version_is_that_of_the_installed_package():
 
 
 def points_run(folder: Path) -> Path:
-    return simulate("smooth", folder, seed=5, frames=5, detections_only=True)
+    return simulate("smooth", folder, seed=5, frames=5, points=True)
 
 
 @pytest.mark.parametrize(
@@ -413,7 +412,7 @@ def hears_signals() -> None:
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
 @pytest.mark.parametrize("sent", further_slow(["SIGTERM", "SIGHUP"]))
 def test_a_run_that_is_stopped_by_a_signal_leaves_nothing_and_says_so(tmp_path, sent):
-    simulate("smooth", tmp_path / "run", seed=5, frames=400, detections_only=True)
+    simulate("smooth", tmp_path / "run", seed=5, frames=400, points=True)
     command = [sys.executable, "-P", "-c", PROGRAM, "run", "run", "--out", "out"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, cwd=tmp_path, preexec_fn=hears_signals, **pipes) as running:
@@ -535,8 +534,7 @@ def test_a_batch_reports_every_run_and_ends_with_the_worst_status(tmp_path):
     for runs, status in (([good], 0), ([good, grey], 4), ([grey, tmp_path / "nowhere", good], 1)):
         done = typed("batch", *runs, "--out", out)
         assert done.exit_code == status
-        with (out / "batch.csv").open() as table:
-            assert [Path(r["run"]) for r in csv.DictReader(table)] == runs
+        assert [Path(r["run"]) for r in rows_of(out / "batch.csv")] == runs
         first_words = [line.split(":")[0] for line in done.stdout.splitlines()]
         assert [word for word in first_words if word != "done already"] == [*(r.name for r in runs), "table", "index"]
     assert "nowhere: expected a run folder, found nothing" in done.output
@@ -561,7 +559,7 @@ def test_a_stopped_batch_reports_it(tmp_path, monkeypatch):
 
 
 def test_ctrl_c_ends_a_watched_recording_and_writes_its_results(tmp_path):
-    simulate("smooth", tmp_path / "run", seed=5, frames=8, picture_scale=0.25)
+    simulate("smooth", tmp_path / "run", seed=5, frames=8, scale=0.25)
     command = [sys.executable, "-P", "-c", PROGRAM, "watch", "run", "--out", "out"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watching:
         until, table = time.monotonic() + 60, tmp_path / "out/attitude_live.csv"

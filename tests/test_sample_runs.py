@@ -44,8 +44,7 @@ def test_the_readme_shows_the_command_that_the_script_runs(name):
     options = dict(zip(words[::2], words[1::2], strict=True))
     sample = dict(make.SAMPLES[name])
     assert command[1] == sample.pop("scenario")
-    called = {"picture_scale": "scale", "detections_only": "points"}
-    assert options == {f"--{called.get(key, key)}": str(value) for key, value in sample.items()}
+    assert options == {f"--{key}": str(value) for key, value in sample.items()}
 
 
 @pytest.mark.parametrize("name", make.SAMPLES)

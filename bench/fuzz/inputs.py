@@ -23,12 +23,12 @@ PICTURE_SUFFIXES = (".png", ".tif", ".bmp", ".jpg", ".pgm")
 
 def write_inputs(folder: Path) -> Path:
     """Write all valid inputs into a new folder; returns it."""
-    simulate("huo2015", folder / "points", seed=1, frames=8, detections_only=True)
+    simulate("huo2015", folder / "points", seed=1, frames=8, points=True)
     times = "".join(f"{n},{n / 100}\n" for n in range(8))
     (folder / "points" / "times.csv").write_text(f"frame,t_s\n{times}")
     with (folder / "points" / "run.yaml").open("a") as file:
         file.write("timestamps: times.csv\ntracker:\n  r1_px: 12\n  detect:\n    threshold_sigma: 5.0\n")
-    simulate("huo2015", folder / "pictures", seed=1, frames=2, picture_scale=0.2)
+    simulate("huo2015", folder / "pictures", seed=1, frames=2, scale=0.2)
     shutil.copytree(ROOT / "sample_runs" / "calibration", folder / "calibration")
     _write_lenses(folder / "lenses")
     rng = np.random.default_rng(1)

@@ -44,7 +44,7 @@ def recordings(folder: Path, seed: int) -> dict[str, Path]:
     for k, (name, (scenario, rig)) in enumerate(rigs.items()):
         path = folder / f"rig-{k}.yaml"
         save_rig(rig, path)
-        out[name] = simulate(scenario, folder / f"run-{k}", seed=seed, frames=FRAMES, detections_only=True, rig=path)
+        out[name] = simulate(scenario, folder / f"run-{k}", seed=seed, frames=FRAMES, points=True, rig=path)
     for k, first in enumerate(RANDOM_SEEDS):
         out[f"random {k + 1}"] = write_run_folder(
             random_scene(first + 1000 * (seed - 1), RANDOM_FRAMES), folder / f"random-{k}"

@@ -34,7 +34,7 @@ def run_folder(kept: Path, kind: str, frames: int, scenario: str) -> Path:
         return folder
     shutil.rmtree(folder, ignore_errors=True)
     if kind == "points":
-        return simulate(scenario, folder, seed=SEED, frames=frames, detections_only=True)
+        return simulate(scenario, folder, seed=SEED, frames=frames, points=True)
     simulated = _simulated(kept, scenario)
     folder.mkdir(parents=True)
     shutil.copy(simulated / "rig.yaml", folder / "rig.yaml")

@@ -338,7 +338,6 @@ def _inliers(
 def _inlier_terms(
     every: Mapping[str, Term], fixed: Mapping[str, tuple[Term, ...]], kept: Mapping[str, Bools]
 ) -> dict[str, tuple[Term, ...]]:
-    """The inlier measurements with their stated sigmas."""
     out = {n: (picked(t, kept[n]),) for n, t in every.items()} | dict(fixed)
     if RECORDS in every and not kept[RECORDS].all():
         # A weak prior keeps a position without its record finite where its spots do not determine it.

@@ -27,7 +27,6 @@ from lab.report.run.report_data import pose_residuals
 from lab.results.show import show_frame, write_picture
 from lab.runs.process import process_run
 from lab.simulate.scenarios import SCENARIOS
-from lab.simulate.write import simulate
 from tracking.parameters import TrackerParameters
 from tracking.statuses import PoseStatus
 
@@ -255,7 +254,7 @@ def category(column: Categorical) -> pd.Categorical[str]:
     return pd.Categorical.from_codes(column.codes, categories=pd.Index(column.words, dtype=str))
 
 
-# Runs processed and simulated from Python.
+# Runs processed from Python.
 
 
 def process(
@@ -286,53 +285,6 @@ def process(
     folder = Path(keep.name) / "results" if keep is not None else Path(str(out))
     process_run(Path(run_folder), folder, overrides=settings, causal=causal, progress=progress)
     return Results(folder, Path(run_folder).resolve(), keep)
-
-
-def simulate_run(
-    scenario: str,
-    out: Path | str,
-    *,
-    seed: int = 0,
-    frames: int | None = None,
-    points: bool = False,
-    noise_px: float = 0.1,
-    scale: float = 1.0,
-    video: bool = False,
-    rig: Path | str | None = None,
-    trajectory: Path | str | None = None,
-    rate_hz: float | None = None,
-    exposure_s: float | None = None,
-    light: str | None = None,
-) -> Path:
-    """Write a simulated recording with its truth into a new run folder, as `beampose simulate` does; returns it.
-
-    scenario: a name of `lab.scenarios()`. frames: default: those of the scenario. points: no pictures, but a
-    detections.csv with a noise of `noise_px`. scale: 0.5: pictures half as wide. video: a video per camera. rig: a
-    rig.yaml of one's own; the motion is moved into its view. trajectory: a table of poses (columns of truth/pose.csv)
-    instead of the scenario's motion. rate_hz, exposure_s, light: instead of the scenario's.
-
-    >>> made = lab.simulate_run("sharp-turns", new_folder, frames=3, points=True)
-    >>> sorted(path.name for path in made.iterdir())
-    ['detections.csv', 'rig.yaml', 'run.yaml', 'truth']
-
-    Raises:
-        InputError: an argument is not valid, or the folder exists.
-    """
-    return simulate(
-        scenario,
-        Path(out),
-        seed=seed,
-        frames=frames,
-        detections_only=points,
-        noise_px=noise_px,
-        picture_scale=scale,
-        video=video,
-        rig=None if rig is None else Path(rig),
-        trajectory=None if trajectory is None else Path(trajectory),
-        frame_rate_hz=rate_hz,
-        exposure_s=exposure_s,
-        light=light,
-    )
 
 
 def scenarios() -> pd.Series:

@@ -13,9 +13,9 @@ from lab.commands.common import (
     Commands,
     ImageSize,
     NumberRange,
+    carry_out,
     complete_rigs,
     conclude,
-    progress_bar,
     read_settings,
     seed_option,
     show_line,
@@ -83,9 +83,7 @@ def camera(photos: tuple[Path, ...], board: str, out: Path, name: str | None, **
     from lab.calibrate.camera.camera import CameraOptions, calibrate_camera
 
     chosen = CameraOptions(name=name or out.resolve().name, **options)
-    with progress_bar("photos") as progress:
-        outcome = calibrate_camera(photos, board, out, chosen, progress=progress)
-    conclude(outcome)
+    carry_out("photos", lambda progress: calibrate_camera(photos, board, out, chosen, progress=progress))
 
 
 _project = click.argument("project", type=ANY_PATH)
@@ -103,9 +101,7 @@ def screen(project: Path, out: Path) -> None:
     """
     from lab.calibrate.screens.screen import calibrate_screen
 
-    with progress_bar("survey") as progress:
-        outcome = calibrate_screen(project, out, progress=progress)
-    conclude(outcome)
+    carry_out("survey", lambda progress: calibrate_screen(project, out, progress=progress))
 
 
 @calibrate.command()
@@ -136,9 +132,7 @@ def rig(project: Path, out: Path) -> None:
     """
     from lab.calibrate.rig.rig import calibrate_rig
 
-    with progress_bar("survey, screens and beams") as progress:
-        outcome = calibrate_rig(project, out, progress=progress)
-    conclude(outcome)
+    carry_out("survey, screens and beams", lambda progress: calibrate_rig(project, out, progress=progress))
 
 
 @calibrate.command("check")
@@ -197,9 +191,7 @@ def refine(runs: tuple[Path, ...], rig_path: Path, out: Path, **options: Any) ->
     """
     from lab.calibrate.refine.refine import refine_rig
 
-    with progress_bar("recordings") as progress:
-        outcome = refine_rig(runs, rig_path, out, progress=progress, **options)
-    conclude(outcome)
+    carry_out("recordings", lambda progress: refine_rig(runs, rig_path, out, progress=progress, **options))
 
 
 @calibrate.command()

@@ -122,7 +122,6 @@ def _first(number: int, _frame: FrameType | None) -> None:
 
 
 def _last(number: int, _frame: FrameType | None) -> None:
-    """Ends the process now."""
     remove_unfinished()
     os._exit(128 + number)
 
@@ -379,6 +378,13 @@ def conclude(outcome: Outcome[Any] | Done[Any], *, quiet: bool = False, notes: S
         for note in (*outcome.notes, *notes):
             complain(note)
     sys.exit(outcome.exit_status)
+
+
+def carry_out(name: str, work: Callable[[Progress | None], Outcome[Any] | Done[Any]]) -> NoReturn:
+    """Does the work with a progress bar, and concludes."""
+    with progress_bar(name) as progress:
+        outcome = work(progress)
+    conclude(outcome)
 
 
 # What a run shows while it works: a progress bar, the lines of its log (--verbose), or nothing (--quiet).

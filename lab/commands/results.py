@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lab.commands.common import ANY_PATH, FOLDER, NumberRange, complain, conclude, progress_bar, show_line
+from lab.commands.common import ANY_PATH, FOLDER, NumberRange, carry_out, complain, conclude, progress_bar, show_line
 
 # `beampose check` and `report`: inputs checked, results shown.
 
@@ -23,9 +23,7 @@ def check(path: Path) -> None:
     """
     from lab.runs.input_check import check as check_path
 
-    with progress_bar(path.name) as progress:
-        result = check_path(path, progress)
-    conclude(result)
+    carry_out(path.name, lambda progress: check_path(path, progress))
 
 
 @click.command()
@@ -74,9 +72,7 @@ def report(
     if video:
         from lab.results.show import write_video
 
-        with progress_bar(results.name) as progress:
-            done = write_video(results, run_folder, progress=progress, **given)
-        conclude(done)
+        carry_out(results.name, lambda progress: write_video(results, run_folder, progress=progress, **given))
 
 
 # `beampose compare`: a result against another result of the run, or against a reference.

@@ -18,6 +18,7 @@ from lab.commands.common import (
     FOLDER,
     ImageSize,
     NumberRange,
+    carry_out,
     check_verbosity,
     complain,
     conclude,
@@ -108,9 +109,8 @@ def detect(pictures: tuple[Path, ...], out: Path, **options: Any) -> None:
     """
     from lab.runs.detect.detect import DetectOptions, detect_pictures
 
-    with progress_bar("pictures") as progress:
-        outcome = detect_pictures(list(pictures), out, DetectOptions(**options), progress)
-    conclude(outcome)
+    chosen = DetectOptions(**options)
+    carry_out("pictures", lambda progress: detect_pictures(list(pictures), out, chosen, progress))
 
 
 @click.command()
@@ -139,9 +139,8 @@ def pick(photos: tuple[str, ...], out: Path, **options: Any) -> None:
     """
     from lab.runs.detect.detect import PickOptions, write_pick_page
 
-    with progress_bar("pictures") as progress:
-        done = write_pick_page(photos, out, PickOptions(**options), progress)
-    conclude(done)
+    chosen = PickOptions(**options)
+    carry_out("pictures", lambda progress: write_pick_page(photos, out, chosen, progress))
 
 
 @click.command()

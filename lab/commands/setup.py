@@ -14,6 +14,7 @@ from lab.commands.common import (
     FOLDER,
     ImageSize,
     NumberRange,
+    carry_out,
     complete_codes,
     complete_scenarios,
     conclude,
@@ -189,9 +190,7 @@ def verify(results: Path, run_folder: Path | None) -> None:
     """
     from lab.results.verify import verify as verify_results
 
-    with progress_bar(results.name) as progress:
-        found = verify_results(results, run_folder, progress)
-    conclude(found)
+    carry_out(results.name, lambda progress: verify_results(results, run_folder, progress))
 
 
 @click.command()
@@ -256,7 +255,7 @@ def _six_numbers(ctx: click.Context, parameter: click.Parameter, text: str | Non
 @click.option("--start", callback=_six_numbers, help="Middle of the motion: X,Y,Z,YAW,PITCH,ROLL, m and deg.")
 @click.option("--trajectory", type=ANY_PATH, help="A table of poses, as truth/pose.csv, instead of the motion.")
 @click.option(
-    "--rate", "frame_rate_hz", type=NumberRange(0.1, 1e6), help="Frames per second, instead of those of the scenario."
+    "--rate", "rate_hz", type=NumberRange(0.1, 1e6), help="Frames per second, instead of those of the scenario."
 )
 @click.option(
     "--exposure",
@@ -265,9 +264,7 @@ def _six_numbers(ctx: click.Context, parameter: click.Parameter, text: str | Non
     help="Exposure time, s, instead of the scenario's.",
 )
 @click.pass_context
-def simulate(
-    ctx: click.Context, /, scenario: str, out: Path | None, points: bool, scale: float, start: Any, **options: Any
-) -> None:
+def simulate(ctx: click.Context, /, scenario: str, out: Path | None, start: Any, **options: Any) -> None:
     """Write a simulated recording with its truth; SCENARIO `list` lists all scenarios.
 
     \b
@@ -293,25 +290,17 @@ def simulate(
     if scenario == STEREO:
         from lab.targets.stereo.simulated_recording import write_stereo_recording
 
-        known = {name: options.pop(name) for name in ("seed", "frames", "noise_px")}
+        known = {name: options.pop(name) for name in ("seed", "frames", "noise_px", "points", "scale")}
         for parameter in ctx.command.params:
             if {"start": start, **options}.get(str(parameter.name)) not in (None, False):
                 raise click.UsageError(f"{parameter.opts[0]}: scenario {STEREO} does not have this option.")
-        folder = write_stereo_recording(out, points=points, scale=scale, **known)
+        folder = write_stereo_recording(out, **known)
         show_line(f"run: {folder}")
         return
     notes: list[str] = []
     with progress_bar(scenario) as progress:
-        folder = write_run(
-            scenario,
-            out,
-            detections_only=points,
-            picture_scale=scale,
-            start=None if start is None else Pose.from_ypr(np.deg2rad(start[3:]), np.array(start[:3])),
-            progress=progress,
-            note=notes.append,
-            **options,
-        )
+        middle = None if start is None else Pose.from_ypr(np.deg2rad(start[3:]), np.array(start[:3]))
+        folder = write_run(scenario, out, start=middle, progress=progress, note=notes.append, **options)
     for line in notes:
         show_line(line)
     show_line(f"run: {folder}")

@@ -12,8 +12,7 @@ from lab.commands.common import (
     FOLDER,
     Commands,
     NumberRange,
-    conclude,
-    progress_bar,
+    carry_out,
     provenance,
     read_settings,
     valid_days_option,
@@ -48,12 +47,9 @@ def track() -> None:
 
 
 def _track(ctx: click.Context, target: Target[Any], given: Path, out: Path) -> None:
-    """Track a target and show the outcome."""
     from lab.targets.track import track_target
 
-    with progress_bar(given.name) as progress:
-        outcome = track_target(target, given, out, progress, provenance(ctx))
-    conclude(outcome)
+    carry_out(given.name, lambda progress: track_target(target, given, out, progress, provenance(ctx)))
 
 
 @track.command()
@@ -253,9 +249,7 @@ def stereo(run_folder: Path, out: Path) -> None:
     """
     from lab.targets.stereo.process import process_stereo_run
 
-    with progress_bar(run_folder.name) as progress:
-        outcome = process_stereo_run(run_folder, out, progress)
-    conclude(outcome)
+    carry_out(run_folder.name, lambda progress: process_stereo_run(run_folder, out, progress))
 
 
 @click.command()
@@ -282,6 +276,4 @@ def pair(left: Path, right: Path, board: str, out: Path, names: str, lens: str, 
     if len(both) != 2 or not all(both):
         raise InputError(f"--names: expected two names with a comma between them, got {names!r}")
     options = PairOptions((both[0], both[1]), lens, valid_days)
-    with progress_bar("photos") as progress:
-        outcome = calibrate_pair_folder(left, right, board, out, options, progress=progress)
-    conclude(outcome)
+    carry_out("photos", lambda progress: calibrate_pair_folder(left, right, board, out, options, progress=progress))

@@ -32,10 +32,10 @@ def warm_up() -> float:
         folder = Path(name)
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as other:
             algebra = other.submit(_linear_algebra)
-            pictures = simulate(SCENARIO, folder / "pictures", frames=PICTURES, picture_scale=0.5)
+            pictures = simulate(SCENARIO, folder / "pictures", frames=PICTURES, scale=0.5)
             # The spots' own tracker: it shares only detection and smoothing with the one that this process compiles.
             detecting = other.submit(process_run, pictures, folder / "out-of-other", overrides={"method": "spots"})
-            points = simulate(SCENARIO, folder / "points", frames=FRAMES, detections_only=True)
+            points = simulate(SCENARIO, folder / "points", frames=FRAMES, points=True)
             process_run(points, folder / "out")
             algebra.result()
             detecting.result()

@@ -404,9 +404,7 @@ def _points(work: Path, frame_rate_hz: float) -> None:
         frame_rate_hz=frame_rate_hz,
     )
     with tempfile.TemporaryDirectory(prefix="beampose-") as name:
-        made = simulate(
-            scenario, Path(name) / "run", frames=FRAMES, detections_only=True, clutter=0.0, rig=work / "rig.yaml"
-        )
+        made = simulate(scenario, Path(name) / "run", frames=FRAMES, points=True, clutter=0.0, rig=work / "rig.yaml")
         shutil.copyfile(made / "detections.csv", work / EXAMPLE)
 
 

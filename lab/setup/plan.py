@@ -6,7 +6,6 @@ import datetime
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -328,11 +327,11 @@ def fine_map(plan: Plan, across: int, up: int) -> Array:
 
     Rows are values of coordinate `up`, columns of `across`.
     """
-    fixed: dict[str, Any] = {
+    fixed = {
         name: replace(r, count=_FINE) if i in (across, up) else Range(r.middle, r.middle, 1)
         for i, (name, r) in enumerate(plan.options.ranges.items())
     }
-    fine = plan_grid(plan.rig, plan.errors, plan.sources, replace(plan.options, **fixed))
+    fine = plan_grid(plan.rig, plan.errors, plan.sources, replace(plan.options, stated=fixed))
     values = fine.worst.reshape(_FINE, _FINE, 2)  # the later of the two coordinates varies along the second axis
     return np.swapaxes(values, 0, 1) if across < up else values
 

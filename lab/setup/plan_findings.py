@@ -72,13 +72,8 @@ USUAL: Mapping[str, Range] = MappingProxyType(
 class PlanOptions:
     """Options of a plan."""
 
-    # Position of the body's origin in world, and attitude. None: USUAL about where the rig sees the vehicle.
-    x_m: Range | None = None
-    y_m: Range | None = None
-    z_m: Range | None = None
-    yaw_deg: Range | None = None
-    pitch_deg: Range | None = None
-    roll_deg: Range | None = None
+    # Of the position of the body's origin in world, and of its attitude; others: USUAL about where the rig sees it.
+    stated: Mapping[str, Range] = field(default_factory=dict)
     sigma_px: float = 0.1  # of a spot's coordinates: 0.05 px for clean spots, 0.1 px with speckle
     edge_px: float = 4.0  # minimum distance to the picture's edge: nearer, a spot of the usual 1 px sigma is truncated
     goal_deg: float | None = None  # required attitude sigma along the worst direction ...
@@ -101,17 +96,16 @@ class PlanOptions:
     @property
     def ranges(self) -> dict[str, Range]:
         """The ranges by name, in the order x, y, z, yaw, pitch, roll."""
-        return {name: getattr(self, name) or usual for name, usual in USUAL.items()}
+        return {**USUAL, **self.stated}
 
     def about(self, middle: Pose) -> PlanOptions:
         """The options with the ranges that are not stated moved to a pose."""
         place = (*middle.translation.tolist(), *np.rad2deg(middle.ypr).tolist())
-        moved: dict[str, Any] = {
+        moved = {
             name: Range(usual.first + by, usual.last + by, usual.count)
             for (name, usual), by in zip(USUAL.items(), place, strict=True)
-            if getattr(self, name) is None
         }
-        return replace(self, **moved)
+        return replace(self, stated={**moved, **self.stated})
 
     @property
     def count(self) -> int:
@@ -147,28 +141,19 @@ def _check_range(name: str, r: Range) -> None:
 
 
 def options_of(
-    ranges: Mapping[str, tuple[float, float, int]],
-    *,
-    sigma_px: float | None = None,
-    goal_deg: float | None = None,
-    goal_m: float | None = None,
-    expected: Mapping[str, Any] | None = None,
+    ranges: Mapping[str, tuple[float, float, int]], expected: Mapping[str, Any] | None = None, **numbers: float | None
 ) -> PlanOptions:
     """Options from the values of the command line: ranges (first, last, count) by name; None keeps a default.
 
     Raises InputError: for an unknown name or an invalid number.
     """
-    default = PlanOptions()
     for name in ranges:
-        if name not in default.ranges:
-            raise InputError(f"--range: expected a coordinate, got {name!r}{suggest_name(name, default.ranges)}")
-    chosen: dict[str, Any] = {name: Range(*r) for name, r in ranges.items()}
+        if name not in USUAL:
+            raise InputError(f"--range: expected a coordinate, got {name!r}{suggest_name(name, USUAL)}")
     return PlanOptions(
-        **chosen,
-        sigma_px=default.sigma_px if sigma_px is None else sigma_px,
-        goal_deg=goal_deg,
-        goal_m=goal_m,
+        stated={name: Range(*r) for name, r in ranges.items()},
         expected=dataclass_from_yaml(ExpectedErrors, dict(expected or {}), "--expect"),
+        **{name: number for name, number in numbers.items() if number is not None},
     )
 
 

@@ -301,8 +301,7 @@ class Occlusion:
     """Obstacles between a beam and its screen: an occluded spot is invisible to every camera."""
 
     miss_probability: float = 0.0  # of each spot in each frame, independently
-    at_bends_frames: int = 0  # frames of occlusion around each bend ...
-    at_bends_spots: int = 1  # ... and number of occluded spots, drawn for each bend
+    at_bends_frames: int = 0  # frames of occlusion of one spot, drawn for each bend, around the bend
     blackout_every: int = 0  # frames between the starts of blackouts; 0: none
     blackout_frames: int = 0  # duration, in which all spots are occluded
     clean_start: int = 10  # first frames without occlusions

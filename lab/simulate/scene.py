@@ -233,7 +233,7 @@ def _occluded_spots(scenario: Scenario, n_spots: int, count: int, bend_frames: I
     occluded = np.zeros((count, n_spots), dtype=bool)
     if occlusion.at_bends_frames:
         for i, bend in enumerate(bend_frames):
-            spots = np.random.default_rng([seed, BENDS, i]).permutation(n_spots)[: occlusion.at_bends_spots]
+            spots = np.random.default_rng([seed, BENDS, i]).permutation(n_spots)[:1]
             first = max(0, int(bend) + 1 - occlusion.at_bends_frames // 2)
             occluded[first : first + occlusion.at_bends_frames, spots] = True
     if occlusion.blackout_every:

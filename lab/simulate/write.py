@@ -184,80 +184,87 @@ _BATCH = 8  # pictures rendered in parallel before they are written to a video
 
 def simulate(
     scenario: str | Scenario,
-    out_folder: Path,
+    out: Path | str,
     *,
     seed: int = 0,
     frames: int | None = None,
     video: bool = False,
-    detections_only: bool = False,
+    points: bool = False,
     light: str | None = None,
     clutter: float | None = None,
     noise_px: float = 0.1,
-    picture_scale: float = 1.0,
+    scale: float = 1.0,
     noisy: bool = True,
     threads: int | None = None,
     progress: Progress | None = None,
-    rig: Path | None = None,
-    known_rig: Path | None = None,
+    rig: Path | str | None = None,
+    known_rig: Path | str | None = None,
     start: Pose | None = None,
-    trajectory: Path | None = None,
-    frame_rate_hz: float | None = None,
+    trajectory: Path | str | None = None,
+    rate_hz: float | None = None,
     exposure_s: float | None = None,
     note: Callable[[str], None] | None = None,
 ) -> Path:
-    """Write one recording of a scenario into a new folder; returns the folder, complete.
+    """Write one recording of a scenario into a new folder; returns the folder, complete. In Python: `lab.simulate_run`.
+
+    >>> made = lab.simulate_run("sharp-turns", new_folder, frames=3, points=True)
+    >>> sorted(path.name for path in made.iterdir())
+    ['detections.csv', 'rig.yaml', 'run.yaml', 'truth']
 
     The same arguments give the same bytes (with the same versions of numpy and OpenCV), and the first frames do not
     depend on the number of frames.
 
     scenario: a name of SCENARIOS, or a value. frames: default: those of the scenario. video: one lossless video per
-    camera instead of PNG files. detections_only: no pictures, but a detections.csv with `noise_px` (1 sigma per axis).
-    light: a name of LIGHTS instead of the light of the scenario. clutter: as in simulate_points. picture_scale: 0.5
-    gives pictures of half the width and height. noisy: False: no shot and read noise, only rounding. threads: number of
-    threads that render and write pictures. progress: called after each picture. rig: a rig.yaml instead of the rig of
-    the scenario: the motion is moved to where that rig sees the vehicle, and as large as keeps half of its spots in
-    view. known_rig: the rig.yaml written to the run folder, such as a calibration of that rig; default: the true one.
-    start: the middle of the motion, instead of that of the rig's view. trajectory: a table of poses (columns of
-    truth/pose.csv) instead of the scenario's motion, with its rate and length. frame_rate_hz, exposure_s: instead of
-    those of the scenario or the trajectory. note: called with a line for each spot that leaves the view of a
-    trajectory. Raises InputError: an argument is not valid, or the folder exists.
+    camera instead of PNG files. points: no pictures, but a detections.csv with `noise_px` (1 sigma per axis). light: a
+    name of LIGHTS instead of the light of the scenario. clutter: as in simulate_points. scale: 0.5 gives pictures of
+    half the width and height. noisy: False: no shot and read noise, only rounding. threads: number of threads that
+    render and write pictures. progress: called after each picture. rig: a rig.yaml instead of the rig of the scenario:
+    the motion is moved to where that rig sees the vehicle, and as large as keeps half of its spots in view. known_rig:
+    the rig.yaml written to the run folder, such as a calibration of that rig; default: the true one. start: the middle
+    of the motion, instead of that of the rig's view. trajectory: a table of poses (columns of truth/pose.csv) instead
+    of the scenario's motion, with its rate and length. rate_hz, exposure_s: instead of those of the scenario or the
+    trajectory. note: called with a line for each spot that leaves the view of a trajectory. Raises InputError: an
+    argument is not valid, or the folder exists.
     """
-    if picture_scale != 1.0 and (rig is not None or known_rig is not None):
+    if scale != 1.0 and (rig is not None or known_rig is not None):
         raise InputError("the pictures of a rig file keep its size: omit the scale or the rig")
-    if not 0.05 <= picture_scale <= 4.0:
-        raise InputError(f"picture_scale: expected 0.05 to 4, got {picture_scale:g}")
-    true_file = None if rig is None else load_rig_file(rig)
+    if not 0.05 <= scale <= 4.0:
+        raise InputError(f"scale: expected 0.05 to 4, got {scale:g}")
+    true_file = None if rig is None else load_rig_file(Path(rig))
     true_rig = None if true_file is None else true_file.rig
-    known = None if known_rig is None else load_rig_file(known_rig)
+    known = None if known_rig is None else load_rig_file(Path(known_rig))
     if start is not None and trajectory is not None:
         raise InputError("a trajectory states where the vehicle is; omit the start or the trajectory")
     scenario = _with_light(scenario_with(scenario, clutter=clutter), light)
     seen_by = RIGS[scenario.rig]() if true_rig is None else true_rig
     if trajectory is not None:
-        scenario, notes = along(scenario, Path(trajectory), seen_by, frame_rate_hz)
+        scenario, notes = along(scenario, Path(trajectory), seen_by, rate_hz)
         if note is not None:
             for line in notes:
                 note(line)
     elif true_rig is not None or start is not None:
         scenario = placed(scenario, seen_by, start)
-    scenario = scenario_with(scenario, frame_rate_hz=frame_rate_hz, exposure_s=exposure_s)
+    scenario = scenario_with(scenario, frame_rate_hz=rate_hz, exposure_s=exposure_s)
     if video:
-        _check_video(scenario, detections_only)
-    with atomic_folder(Path(out_folder), lambda _: False) as folder:
-        scene = compose(scenario, seed, frames, picture_scale, true_rig)
+        _check_video(scenario, points)
+    with atomic_folder(Path(out), lambda _: False) as folder:
+        scene = compose(scenario, seed, frames, scale, true_rig)
         if known is not None and SpotModel.of(known.rig).views != scene.model.views:
             raise InputError(f"{known_rig}: expected the cameras and spots of the rig that is recorded, got others")
         forms = {} if true_file is None else true_file.measured_as
         save_rig(RigFile(scene.rig, measured_as=forms) if known is None else known, folder / "rig.yaml")
         write_truth(scene, folder / "truth")
-        if detections_only:
+        if points:
             _write_detections(scene, noise_px, folder / "detections.csv")
             sources = {name: {"detections": "detections.csv"} for name in scene.model.camera_names}
         else:
             write = _write_videos if video else _write_pictures
             sources = write(scene, folder, noisy, threads, progress)
         save_run(_run_mapping(scene, sources, known), folder)
-    return Path(out_folder)
+    return Path(out)
+
+
+simulate_run = simulate  # its name in `lab`
 
 
 def _with_light(scenario: Scenario, light: str | None) -> Scenario:
@@ -268,8 +275,8 @@ def _with_light(scenario: Scenario, light: str | None) -> Scenario:
     return replace(scenario, light=LIGHTS[light])
 
 
-def _check_video(scenario: Scenario, detections_only: bool) -> None:
-    if detections_only:
+def _check_video(scenario: Scenario, points: bool) -> None:
+    if points:
         raise InputError("a recording is a video or points, not both; choose one")
     if scenario.faults:
         raise InputError(

@@ -70,7 +70,6 @@ def _arcs(rng: np.random.Generator, size_px: tuple[int, int]) -> Floats32:
 
 
 def _letters(rng: np.random.Generator, size_px: tuple[int, int]) -> Floats32:
-    """Letters and digits of all sizes."""
     width, height = size_px
     field = np.full((height, width), 128, np.uint8)  # OpenCV writes text on 8-bit pictures only
     for _ in range(int(rng.integers(4, 30))):

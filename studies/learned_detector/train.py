@@ -193,7 +193,6 @@ def _kept(steps: int) -> float:
 
 
 def _keep(parts: dict[str, Any], plan: Plan, out: Path, log: list[dict[str, float]], spent: float) -> None:
-    """Write the checkpoint and the log."""
     import torch
 
     state = {name: part.state_dict() for name, part in parts.items()}

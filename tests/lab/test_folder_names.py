@@ -9,10 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 
-from cli import main
 from lab.simulate.write import simulate
+from tests.lab.command import typed
 from tests.paths import ROOT
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
@@ -26,13 +25,9 @@ def named(folder: Path, name: bytes) -> Path:
 def place(tmp_path_factory) -> Path:
     """A folder with a run and its results."""
     folder = named(tmp_path_factory.mktemp("disk"), b"Universit\xe9")
-    simulate("smooth", named(folder, b"caf\xe9"), seed=1, frames=8, detections_only=True)
+    simulate("smooth", named(folder, b"caf\xe9"), seed=1, frames=8, points=True)
     assert typed("run", named(folder, b"caf\xe9"), "--out", named(folder, b"r\xe9sultats")).exit_code == 0
     return folder
-
-
-def typed(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 def test_the_summary_names_the_folders_such_that_they_are_found_again(place):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pytest
 
 from studies.comparison import write_comparison
 from studies.huo2015 import NOISE_PX, comparison_of, prediction_errors, repeat_huo2015
+from tests.lab.tables import rows_of
 
 FRAMES = 200  # a bend, and spots 3 and 6 leave the picture
 
@@ -52,8 +51,7 @@ def test_only_the_recognition_rate_of_the_paper_counts_out_of_view_estimates_as_
 
 def test_the_files_of_a_study_are_complete(tmp_path, study):
     outcome = write_comparison(comparison_of(study), tmp_path / "study")
-    with (outcome.result / "figures.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(outcome.result / "figures.csv")
     assert list(rows[0]) == ["quantity", "unit", "paper", "conventional", "curve_switching", "beampose", "note"]
     assert [r["quantity"] for r in rows] == [r.quantity for r in study.rows]
     assert float(rows[0]["conventional"]) == pytest.approx(study.rows[0].values[0], rel=1e-5)

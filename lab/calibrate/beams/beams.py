@@ -139,7 +139,6 @@ def _calibrated_lab(project: Project, rig_path: Path) -> tuple[RigFile, RigCovar
 
 
 def _lab_findings(with_covariance: bool, state: CalibrationState | None, rig_path: Path) -> list[Finding]:
-    """Findings on the calibrated cameras and screens."""
     out = []
     if state is not None and state.verdict != Level.PASS.name:
         why = "; ".join(state.reasons) or "no reason given"

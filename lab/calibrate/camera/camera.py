@@ -132,7 +132,6 @@ def _solve(
 
 
 def _views(photos: list[Path | str], board: Board, options: CameraOptions, progress: Progress | None) -> PhotoSet:
-    """From photographs or from a table of corners."""
     table = Path(photos[0]) if len(photos) == 1 and Path(photos[0]).suffix.lower() in TABLE_SUFFIXES else None
     if table is None and options.image_size_px is None:
         return find_in_photos(photos, board, progress, fewest=FEWEST_VIEWS)

@@ -259,7 +259,6 @@ def _sigma(covariance: Array) -> Array:
 
 
 def _one_point(n: int, i: int) -> ChangeCandidate:
-    """The change that moves only pixel i of n."""
     out = np.zeros((2 * n, 2))
     out[2 * i, 0] = out[2 * i + 1, 1] = 1.0
     return ChangeCandidate(out, np.full(2, USUAL_SIZES.point_px))

@@ -15,7 +15,7 @@ from lab.errors import InputError
 from lab.files.project.point_files import POINTS, pixels_in
 from lab.files.run.results import read_poses, read_spots
 from lab.files.run.truth import read_true_poses
-from lab.files.text.csv_text import Table, read_table
+from lab.files.text.csv_text import Table, check_coordinates, check_sigmas, read_table
 from lab.files.text.error_text import suggest_name
 
 PLACES = ("x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
@@ -144,6 +144,9 @@ def _coordinates(table: Table, rig: Rig) -> dict[str, tuple[list[float], list[fl
         )
     names = ("x_m", "y_m") if on_screens else ("x_m", "y_m", "z_m")
     places = table.finite_stack(*names)
+    check_coordinates(table, names, _MAX_COORDINATE_M)
+    for name in names:
+        check_sigmas(table, f"sigma_{name}", (0.0, _MAX_COORDINATE_M), "m")
     sigmas = np.nan_to_num(np.stack([table.optional(f"sigma_{name}") for name in names], axis=1))
     screens = [""] * len(table)
     if on_screens:
@@ -153,18 +156,6 @@ def _coordinates(table: Table, rig: Rig) -> dict[str, tuple[list[float], list[fl
     out: dict[str, tuple[list[float], list[float], str]] = {}
     for i, point in enumerate(table.names("point")):
         place, sigma = places[i].tolist(), sigmas[i].tolist()
-        if max(map(abs, place)) > _MAX_COORDINATE_M:
-            raise table.error(
-                i,
-                f"{','.join(names)}: expected metres, got {max(place, key=abs):g}; are these millimetres? divide by"
-                " 1000",
-            )
-        if not 0 <= min(sigma) <= max(sigma) <= _MAX_COORDINATE_M:
-            raise table.error(
-                i,
-                f"expected sigmas in metres, 0 to {_MAX_COORDINATE_M:g}, got"
-                f" {min(sigma) if min(sigma) < 0 else max(sigma):g}; correct it, or leave the field empty",
-            )
         entry = (place + fill, sigma + fill, screens[i])
         if out.setdefault(point, entry) != entry:
             raise table.error(i, f"point {point!r} has two different positions; give them different names")

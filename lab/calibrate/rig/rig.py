@@ -236,7 +236,6 @@ def _step_findings(steps: RigCalibration, nominal: Rig, positions: Sequence[str]
 
 
 def _lens_findings(project: Project, day: datetime.date) -> list[Finding]:
-    """Findings on the lens calibrations of the cameras."""
     out = []
     for name, camera in project.cameras.items():
         state, file = camera.lens.calibration, camera.lens_path.name

@@ -413,7 +413,6 @@ def _beams(o: CalibratedRig, nominal: Rig) -> Section:
 
 
 def _cameras(o: CalibratedRig) -> Section:
-    """Section on the poses of the cameras and the change of their focal lengths."""
     joint = o.steps.joint
     sigmas = dict(zip(joint.covariance.names, np.sqrt(np.diagonal(joint.covariance.matrix)), strict=True))
     before = o.steps.measured.network.rig
@@ -435,7 +434,6 @@ def _cameras(o: CalibratedRig) -> Section:
 
 
 def _correlations(o: CalibratedRig) -> Section:
-    """Section on the correlations of the parameters."""
     C = o.steps.joint.covariance
     sigma = np.sqrt(np.diagonal(C.matrix))
     shown = [
@@ -459,7 +457,6 @@ def _short_name(name: str) -> str:
 
 
 def _lab(o: CalibratedRig) -> Section:
-    """Section with three views of the lab."""
     joint = o.steps.joint
     body = (
         o.expected.world_from_body

@@ -62,7 +62,6 @@ def nonzero_vector(value: Any) -> list[float]:
 
 
 def _points(points: int) -> Callable[[Any], list[list[float]]]:
-    """A validator of lists of `points` points."""
 
     def check(value: Any) -> list[list[float]]:
         if not isinstance(value, list) or len(value) != points:

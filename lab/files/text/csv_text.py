@@ -213,7 +213,6 @@ class _Columns:
 
 
 def _read_regular(path: Path, data: bytes, header: tuple[str, ...], wanted: Sequence[str]) -> Table:
-    """A regular file, split at its commas."""
     columns, line = _Columns(header, wanted), 2
     begin = data.find(b"\n") + 1
     while begin < len(data):

@@ -226,7 +226,6 @@ def _scale_bar(p: svg.PlotArea, stretch: float, bar: float) -> str:
 
 
 def _photograph(p: svg.PlotArea, picture: np.ndarray) -> str:
-    """The photograph inside the axes, as JPEG."""
     if picture.dtype != np.uint8:
         top = max(float(picture.max()), 1.0)
         picture = (picture.astype(float) * (255 / top)).astype(np.uint8)

@@ -310,7 +310,6 @@ def _scatter_near(data: ResultData, index: int, j: int) -> Array:
 
 
 def _beam(data: ResultData, j: int, world_from_body: Pose) -> Array:
-    """The image of the beam of view j."""
     if data.run is None:
         return _NONE
     camera, spot = data.spots.views[j]

@@ -242,7 +242,6 @@ def time_panel(
 
 
 def _line_data(zoom: ZoomData | None, line: Line, fine: bool) -> str:
-    """The attribute that names the series of a line."""
     name = None if zoom is None else zoom.add(line.y, fine)
     return "" if name is None else f' data-s="{name}"'
 

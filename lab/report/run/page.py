@@ -218,7 +218,6 @@ def _event_rows(m: ReportData, found: list[ShownEvent]) -> list[tuple[str, str, 
 
 
 def _missing(m: ReportData) -> list[str]:
-    """The parts that are missing from this report, with the reason."""
     out = []
     if not m.summary.present:
         out.append("summary.json is missing: no verdict, parameters, versions or fingerprints.")

@@ -19,7 +19,7 @@ from lab.files.run.run_file import load_run
 from lab.files.text import columns
 from tests.paths import ROOT
 
-MODULES = ("lab.api.results", "lab.api.tracking")
+MODULES = ("lab.api.results", "lab.api.tracking", "lab.simulate.write")
 
 
 @pytest.fixture(scope="module")

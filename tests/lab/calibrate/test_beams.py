@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import shutil
 from dataclasses import replace
@@ -45,6 +44,7 @@ from lab.files.text.yaml_text import write_mapping
 from lab.findings.finding import Level
 from lab.simulate.scenarios import RIGS
 from tests.calibration.beams.bench import ARCSEC, WORLD_FROM_STAND, drawn, errors, positions, recorded
+from tests.lab.tables import rows_of
 
 STAND = {
     "world_from_stand": {
@@ -130,11 +130,6 @@ def campaign(first_campaign, tmp_path) -> tuple[Rig, Path]:
     return RIGS["unequal-fan"](), tmp_path / "calibration.yaml"
 
 
-def table(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def test_recorded_positions_give_a_rig_with_the_joint_covariance_of_its_beams(campaign, tmp_path):
     rig, project = campaign
     outcome = calibrate_beams(project, tmp_path / "out")
@@ -159,16 +154,16 @@ def test_recorded_positions_give_a_rig_with_the_joint_covariance_of_its_beams(ca
 def test_the_tables_hold_the_calibrated_beams_angles_and_residuals(campaign, tmp_path):
     _, project = campaign
     outcome = calibrate_beams(project, tmp_path / "out")
-    beams = table(tmp_path / "out" / "beams.csv")
+    beams = rows_of(tmp_path / "out" / "beams.csv")
     assert [b["beam"] for b in beams] == ["A", "B", "C"]
     direction = np.array([[float(b[k]) for k in ("dx", "dy", "dz")] for b in beams])
     np.testing.assert_allclose(direction, outcome.result.lines.directions, atol=1e-11)
     assert all(0 < float(b["sigma_direction_arcsec"]) < 20 for b in beams)
-    angles = table(tmp_path / "out" / "angles.csv")
+    angles = rows_of(tmp_path / "out" / "angles.csv")
     assert [(a["first"], a["second"]) for a in angles] == [("A", "B"), ("A", "C"), ("B", "C")]
     assert float(angles[1]["angle_deg"]) == pytest.approx(41.0, abs=0.01)
-    residuals = table(tmp_path / "out" / "residuals.csv")
-    assert len(residuals) == len(table(tmp_path / "spots.csv"))
+    residuals = rows_of(tmp_path / "out" / "residuals.csv")
+    assert len(residuals) == len(rows_of(tmp_path / "spots.csv"))
     rms = np.sqrt(np.mean([float(r["residual_mm"]) ** 2 for r in residuals]) / 2)
     assert 0.15 < rms < 0.3  # mm: the simulated noise, larger where the camera sees the screen at an angle
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -185,7 +180,7 @@ def test_without_poses_only_the_angles_are_found_and_the_result_says_so(campaign
     assert "3 beams from 40 positions at unknown poses, angles between beams to" in outcome.line()
     words = " ".join(f.what for f in outcome.findings)
     assert "6 parameters remain undetermined, the position (3) and the attitude (3) of the body frame" in words
-    angles = table(tmp_path / "out" / "angles.csv")
+    angles = rows_of(tmp_path / "out" / "angles.csv")
     assert float(angles[0]["angle_deg"]) == pytest.approx(18.0, abs=0.01)
     assert "closest to the nominal ones" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
@@ -204,7 +199,7 @@ def test_a_stand_that_only_yaws_fails_with_the_remedy_and_writes_no_rig(tmp_path
     assert "all beams relative to the stand: a rotation about z" in bad.what
     assert bad.remedy.startswith("add positions turned by 10 deg or more about the stand's x and y")
     assert not (tmp_path / "out" / "rig.yaml").exists()
-    assert {b["sigma_direction_arcsec"] for b in table(tmp_path / "out" / "beams.csv")} == {""}
+    assert {b["sigma_direction_arcsec"] for b in rows_of(tmp_path / "out" / "beams.csv")} == {""}
     assert "add positions turned" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8").lower()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
 import json
 import re
@@ -10,9 +9,7 @@ import re
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from lab.calibrate.camera.camera import (
     CAMERA,
     CORNER_COLUMNS,
@@ -25,6 +22,8 @@ from lab.calibrate.camera.camera import (
 from lab.errors import CalibrationError, InputError
 from lab.files.rig.camera_file import load_camera
 from lab.findings.finding import Level
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.paths import DATA
 
 STEREO = DATA / "chessboard_stereo_opencv"
@@ -88,8 +87,7 @@ def test_camera_yaml_reads_back_and_states_its_uncertainty(left):
 
 
 def test_the_table_of_corners_has_a_row_per_corner_and_its_residuals_give_the_rms(left):
-    with (left.out / CORNERS).open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(left.out / CORNERS)
     assert tuple(rows[0]) == CORNER_COLUMNS
     assert len(rows) == 7 * 54
     used = [r for r in rows if r["used"] == "1"]
@@ -196,7 +194,7 @@ def test_copies_of_other_quality_change_nothing_and_are_named(tmp_path):
             for quality in (90, 60, 30) if out == "often" else ():
                 name = str(tmp_path / "shots" / f"{path.stem}_q{quality}.jpg")
                 cv2.imwrite(name, picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        done = CliRunner().invoke(main, [*given, "--lens", "4", "--warp", "off", "--stretch", "off"])
+        done = typed(*given, "--lens", "4", "--warp", "off", "--stretch", "off")
         assert done.exit_code == 0, done.output
     once, often = (load_camera(tmp_path / out / CAMERA) for out in ("once", "often"))
     np.testing.assert_array_equal(once.covariance.matrix, often.covariance.matrix)

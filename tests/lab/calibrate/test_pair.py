@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from calibration.lens.fit.lens_models import LensModel
 from calibration.lens.intrinsics import Intrinsics, IntrinsicsOptions, calibrate_intrinsics
 from calibration.pair import PairError, calibrate_pair
-from cli import main
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.calibrate.camera.pair import findings_of, next_pairs, range_sigmas
@@ -23,6 +20,8 @@ from lab.files.rig.pair_file import load_pair_file
 from lab.findings.finding import Level, verdict
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.calibration.lens.lens_scenes import Scene, photographs
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 
 NAMES = ("left", "right")
 
@@ -81,7 +80,7 @@ def photographs_of_a_pair(folder: Path) -> None:
 def test_photographs_of_two_cameras_give_their_distance_to_its_sigma(tmp_path):
     photographs_of_a_pair(tmp_path)
     command = ["calibrate", "pair", str(tmp_path / "left"), str(tmp_path / "right"), "--board", BOARD, "--lens", "0"]
-    done = CliRunner().invoke(main, [*command, "--out", str(tmp_path / "out")])
+    done = typed(*command, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     pair = load_pair_file(tmp_path / "out" / "pair.yaml")
     right = pair.cameras["right"].camera_from_world
@@ -89,6 +88,5 @@ def test_photographs_of_two_cameras_give_their_distance_to_its_sigma(tmp_path):
     sigma_m = float(np.sqrt(pair.covariance.matrix[row, row]))
     assert abs(right.translation[0] + BASELINE_M) < 4 * sigma_m
     assert sigma_m < 1e-3
-    with (tmp_path / "out" / "pairs.csv").open(newline="") as file:
-        assert len(list(csv.DictReader(file))) == PAIRS
+    assert len(rows_of(tmp_path / "out" / "pairs.csv")) == PAIRS
     assert "Pair" in (tmp_path / "out" / "report.html").read_text()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 from dataclasses import replace
@@ -12,14 +11,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
 
 from bench import refine as bench
 from bench.random_scenes.write_folder import write_run_folder
 from calibration.least_squares.adjustment import AdjustmentError
 from calibration.rig.refinement import MOTIONS, further_motions
 from calibration.terms.rig_blocks import prior_of, stacks_of
-from cli import main
 from geometry.rig import Rig
 from geometry.uncertainty.chi_square import chi2_limit
 from geometry.uncertainty.rig_uncertainty import covariance_root, perturbed_rig
@@ -31,6 +28,8 @@ from lab.files.rig.rig_file import RigFile, covariance_blocks, joint_covariance,
 from lab.files.run.run_file import load_run
 from lab.findings.finding import Level
 from lab.simulate.write import simulate
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
 from tracking.setup_mistakes import evidence
 
@@ -41,16 +40,11 @@ SIGMAS = {
 FRAMES = 60
 
 
-def typed(*arguments: object):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
-
-
 def recordings(
     folder: Path, scenario: str = "two-cameras-per-screen", count: int = 2, frames: int = FRAMES
 ) -> list[Path]:
     return [
-        simulate(scenario, folder / f"run{i}", seed=i, frames=frames, detections_only=True, clutter=0.0)
-        for i in range(count)
+        simulate(scenario, folder / f"run{i}", seed=i, frames=frames, points=True, clutter=0.0) for i in range(count)
     ]
 
 
@@ -114,8 +108,7 @@ def test_the_new_rig_names_its_parent_and_recordings_with_their_checksums(lab):
 
 def test_the_table_of_residuals_shows_the_noise_that_is_left(lab):
     folder, _, _, _ = lab
-    with (folder / "new" / "residuals.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(folder / "new" / "residuals.csv")
     given, refined = (
         np.array([[float(r[f"d{axis}_{name}_px"]) for axis in "uv"] for r in rows]) for name in ("given", "refined")
     )

@@ -26,6 +26,7 @@ from lab.findings.finding import Level
 from lab.runs.process import process_run
 from lab.simulate.campaign import CampaignQuality, simulate_calibration
 from lab.simulate.write import simulate
+from tests.lab.tables import rows_of
 
 DAY = datetime.date(2026, 3, 14)
 SMALL = CampaignQuality(dots=(5, 4))
@@ -91,11 +92,10 @@ def test_the_rig_file_reads_back_with_the_same_joint_covariance(outcome):
 
 def test_errors_of_poses_measured_with_the_calibrated_rig_agree_with_their_covariance(project, outcome, tmp_path):
     """End to end: a recording of the true rig, tracked with the calibrated one."""
-    run = simulate("smooth", tmp_path / "run", seed=3, frames=12, detections_only=True, noise_px=0.054, clutter=0.0)
+    run = simulate("smooth", tmp_path / "run", seed=3, frames=12, points=True, noise_px=0.054, clutter=0.0)
     truth = load_rig(project / "truth" / "rig.yaml")
     true_poses = truth_poses(run)
-    with (run / "detections.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(run / "detections.csv")
     write_detections_of(truth, true_poses, run, rows[0].keys())
     file = load_rig_file(outcome.out / "rig.yaml")
     save_rig(dataclasses.replace(file, calibration=None), run / "rig.yaml")  # without the expiry date
@@ -110,8 +110,7 @@ def test_errors_of_poses_measured_with_the_calibrated_rig_agree_with_their_covar
 
 
 def truth_poses(run):
-    with (run / "truth" / "pose.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(run / "truth" / "pose.csv")
     q = np.array([[float(r[c]) for c in ("qw", "qx", "qy", "qz")] for r in rows])
     return Pose.from_quaternion(q, np.array([[float(r[c]) for c in ("x_m", "y_m", "z_m")] for r in rows]))
 
@@ -134,8 +133,7 @@ def write_detections_of(rig, poses, run, header):
 
 
 def test_the_table_of_residuals_has_a_row_per_number_with_its_unit(outcome):
-    with (outcome.out / "residuals.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(outcome.out / "residuals.csv")
     assert tuple(rows[0]) == COLUMNS
     kinds = {r["kind"] for r in rows}
     assert kinds == {"spot", "dot", "survey", "stand"}
@@ -236,7 +234,7 @@ def test_recordings_can_be_run_folders_with_unlabelled_spots(tmp_path):
     nothing = dict.fromkeys(("camera_m", "camera_deg", "screen_m", "screen_deg", "beam_deg", "beam_m"), 0.0)
     as_designed = CampaignQuality(**nothing, focal_px=0.0, centre_px=0.0, distortion_share=0.0)
     project = simulate_calibration(tmp_path / "lab", seed=5, quality=as_designed)
-    simulate("smooth", project / "run", seed=2, frames=60, detections_only=True, noise_px=0.054)
+    simulate("smooth", project / "run", seed=2, frames=60, points=True, noise_px=0.054)
     path = project / "calibration.yaml"
     text, count = re.subn(r"recordings:\n- .*\n", "recordings:\n- {run: run, use_truth: true}\n", path.read_text())
     assert count == 1
@@ -261,8 +259,7 @@ def with_survey_columns(project, tmp_path, order):
     """A copy of the project whose survey has its coordinates in another order."""
     copy = tmp_path / "project"
     shutil.copytree(project, copy)
-    with open(copy / "survey.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(copy / "survey.csv")
     names = ("x_m", "y_m", "z_m")
     mixed = [{**row, **{n: row[names[k]] for n, k in zip(names, order, strict=True)}} for row in rows]
     with open(copy / "survey.csv", "w", newline="") as file:

@@ -28,6 +28,7 @@ from lab.findings.finding import Level
 from lab.simulate.board_photo import PhotoSettings, photograph
 from tests.lab.calibrate.screen_projects import truth, write_project
 from tests.lab.files.test_project import TARGET, changed
+from tests.lab.tables import rows_of
 from tests.marks import needs_open3d
 from tests.paths import DATA
 
@@ -36,8 +37,7 @@ BOARD = Charuco(8, 6, 0.15, 0.11, "DICT_4X4_50")
 
 def rewritten(path, change):
     """Rewrite a CSV file with each row (a dict) changed; None removes a row."""
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(path)
     changed_rows = [r for r in map(change, rows) if r is not None]
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
@@ -101,16 +101,14 @@ def test_rig_yaml_holds_the_nominal_beams_and_states_that_they_are_not_calibrate
 def test_the_tables_have_a_row_per_observation_and_per_control_point(good):
     out, _ = good
     for name, columns in (("residuals.csv", RESIDUAL_COLUMNS), ("dots.csv", DOT_COLUMNS)):
-        with (out / name).open() as file:
-            rows = list(csv.DictReader(file))
+        rows = rows_of(out / name)
         assert len(rows) == 32
         assert tuple(rows[0]) == columns
 
 
 def test_the_table_of_control_points_has_their_heights_above_the_surfaces_and_which_were_used(good):
     out, outcome = good
-    with (out / "dots.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(out / "dots.csv")
     for screen in outcome.result.screens:
         mine = [rows[k] for k in screen.control_points]
         heights = [float(r["height_m"]) for r in mine]

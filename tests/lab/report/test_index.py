@@ -7,10 +7,9 @@ from html import unescape
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from lab.simulate.write import simulate
+from tests.lab.command import typed
 
 DAYS = ("2026-03-02", "2026-03-03", "2026-03-05", "2026-03-09", None)
 
@@ -20,11 +19,11 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a batch and its index: four good runs of four days, and a bad one of an unknown day."""
     folder = tmp_path_factory.mktemp("index")
     for number, day in enumerate(DAYS):
-        run = simulate("smooth", folder / f"run{number}", seed=number, frames=4, detections_only=True) / "run.yaml"
+        run = simulate("smooth", folder / f"run{number}", seed=number, frames=4, points=True) / "run.yaml"
         run.write_text(run.read_text() + (f"recorded: {day}\n" if day else ""))
     (folder / "run4" / "detections.csv").unlink()
     names = [str(folder / f"run{number}") for number in range(len(DAYS))]
-    CliRunner().invoke(main, ["batch", *names, "--out", str(folder / "out")])
+    typed("batch", *names, "--out", folder / "out")
     return folder / "out", (folder / "out" / "index.html").read_text()
 
 

@@ -7,9 +7,7 @@ import hashlib
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from geometry.uncertainty.rig_uncertainty import RigCovariance, rig_names
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig_file, save_rig
@@ -18,6 +16,7 @@ from lab.files.text import columns
 from lab.results.certificate import CLOCKS, NOISE, PLACES, TURNS, certificate, write_certificate
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tests.lab.command import typed
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +27,7 @@ def run_folder(tmp_path_factory):
         tmp_path_factory.mktemp("run") / "run",
         seed=11,
         frames=30,
-        detections_only=True,
+        points=True,
         exposure_s=0.006,
     )
     rig_file = load_rig_file(folder / "rig.yaml")
@@ -115,7 +114,7 @@ def test_the_page_states_measurand_budget_and_traceability(results, run_folder):
 
 
 def test_a_rig_without_covariance_makes_an_incomplete_budget_that_says_so(tmp_path):
-    run = simulate("smooth", tmp_path / "run", seed=5, frames=10, detections_only=True)
+    run = simulate("smooth", tmp_path / "run", seed=5, frames=10, points=True)
     process_run(run, tmp_path / "out")
     (tmp_path / "out/budget.csv").unlink()  # as results of earlier versions
     (frame,) = certificate(tmp_path / "out", draws=0).frames
@@ -133,6 +132,6 @@ def test_a_frame_that_is_not_measured_and_a_lost_run_folder_are_errors(results, 
         certificate(results, at=[999], draws=0)
     with pytest.raises(InputError, match=r"run\.yaml"):
         certificate(results, tmp_path, draws=0)
-    done = CliRunner().invoke(main, ["report", str(results), "--at", "3"])
+    done = typed("report", results, "--at", "3")
     assert done.exit_code == 2
     assert "--at is of the certificate" in done.output

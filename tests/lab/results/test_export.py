@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 import lab
@@ -19,6 +18,7 @@ from lab.files.text import columns
 from lab.files.text.csv_text import write_table
 from lab.packages import PACKAGES
 from lab.results.export import FORMATS
+from tests.lab.command import typed
 from tests.paths import ROOT
 
 # world_from_body by axis and angle (deg), place (m) and status of each frame; frame 4 is missing, 6 has no pose.
@@ -200,7 +200,7 @@ def exported(results: Path, to: str, out: Path, *more: str) -> str:
     """What the command prints."""
     if to in PACKAGES:
         pytest.importorskip(PACKAGES[to][0])
-    done = CliRunner().invoke(main, ["export", str(results), "--to", to, "--out", str(out), *more])
+    done = typed("export", results, "--to", to, "--out", out, *more)
     assert done.exit_code == 0, done.output
     return done.output
 

@@ -7,20 +7,19 @@ import shutil
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from lab.errors import InputError
 from lab.files.run import fingerprints
 from lab.results.verify import difference_of, read_recorded, verify
 from lab.simulate.write import simulate
+from tests.lab.command import typed
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run of points (`run`) and its results (`out`), made with a parameter that is not the default."""
     folder = tmp_path_factory.mktemp("verify")
-    run = simulate("smooth", folder / "run", seed=5, frames=12, detections_only=True)
+    run = simulate("smooth", folder / "run", seed=5, frames=12, points=True)
     arguments = [
         "run",
         str(run),
@@ -31,7 +30,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "--set",
         "detect.threshold_sigma=6",
     ]
-    done = CliRunner().invoke(main, arguments)
+    done = typed(*arguments)
     assert done.exit_code == 0, done.output
     return folder
 
@@ -57,7 +56,7 @@ def test_a_causal_result_with_full_fingerprints_is_computed_without_smoothing(ma
     with monkeypatch.context() as m:
         m.setattr(fingerprints, "MAX_HASHED_BYTES", 100)
         m.setattr(fingerprints, "_of_file", lambda path, full: read.append(path) or of_file(path, full))
-        assert CliRunner().invoke(main, arguments).exit_code == 0
+        assert typed(*arguments).exit_code == 0
     inputs = json.loads((tmp_path / "out" / "summary.json").read_text())["inputs"]
     assert {entry["covers"] for entry in inputs} == {"contents"}
     assert sorted(map(str, read)) == sorted(entry["path"] for entry in inputs)  # each once

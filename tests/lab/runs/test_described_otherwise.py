@@ -16,6 +16,7 @@ from lab.files.rig.rig_file import load_rig, save_rig
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tests.lab.tables import rows_of
 
 FRAMES = 30
 HERE = Pose.identity()
@@ -98,7 +99,7 @@ def with_smaller_pixels(rig: Rig) -> Description:
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
     folder = tmp_path_factory.mktemp("given")
-    run = simulate("smooth", folder / "run", seed=7, frames=FRAMES, detections_only=True)
+    run = simulate("smooth", folder / "run", seed=7, frames=FRAMES, points=True)
     process_run(run, folder / "out")
     return run, read_poses(folder / "out")
 
@@ -114,8 +115,7 @@ def written(run: Path, new: Description, folder: Path) -> Path:
         "within_m": new.within_m,
     }
     (folder / "run.yaml").write_text(yaml.safe_dump(content))
-    with (run / "detections.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(run / "detections.csv")
     for row in rows:
         for name, offset in (("u_px", 0.5), ("v_px", 0.5), ("sigma_u_px", 0.0), ("sigma_v_px", 0.0)):
             row[name] = repr(new.pixels * float(row[name]) + (offset if new.pixels != 1 else 0.0))

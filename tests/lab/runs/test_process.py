@@ -75,7 +75,7 @@ def names(folder: Path) -> list[str]:
 
 
 def points_run(folder: Path, frames: int = 12, seed: int = 5) -> Path:
-    return simulate("smooth", folder, seed=seed, frames=frames, detections_only=True)
+    return simulate("smooth", folder, seed=seed, frames=frames, points=True)
 
 
 class WeakRecord(FrameRecord):
@@ -93,7 +93,7 @@ def a_tracked_frame(n: int) -> TrackedFrame:
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory) -> Path:
     """Half-size pictures with missing and damaged ones."""
-    return simulate(DAMAGED, tmp_path_factory.mktemp("process") / "run", seed=5, frames=FRAMES, picture_scale=0.5)
+    return simulate(DAMAGED, tmp_path_factory.mktemp("process") / "run", seed=5, frames=FRAMES, scale=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -336,7 +336,7 @@ def test_a_wrong_prior_is_distinguished_from_missing_spots(tmp_path):
 def test_a_camera_that_stops_or_starts_late_is_reported(tmp_path):
     gone = tuple(RecordingFault(k, "dropped", camera) for camera, k in (("left", 12), ("left", 13), ("right", 0)))
     scenario = replace(SCENARIOS["smooth"], faults=gone)
-    folder = simulate(scenario, tmp_path / "run", seed=5, frames=FRAMES, picture_scale=0.3)
+    folder = simulate(scenario, tmp_path / "run", seed=5, frames=FRAMES, scale=0.3)
     process_run(folder, tmp_path / "out")
     reasons = reasons_of(tmp_path / "out")
     assert (
@@ -480,7 +480,7 @@ def test_a_wrong_override_is_an_input_error_and_nothing_is_written(tmp_path, ove
 @pytest.mark.parametrize("method", ["rigid", "spots"])
 def test_a_run_without_a_prior_gives_the_same_as_with_one(tmp_path, method):
     """Four skew beams have no symmetry, so their first labels need no prior."""
-    folder = simulate("four-skew-beams", tmp_path / "run", seed=5, frames=20, detections_only=True)
+    folder = simulate("four-skew-beams", tmp_path / "run", seed=5, frames=20, points=True)
     process_run(folder, tmp_path / "with", overrides={"method": method})
     content = yaml.safe_load((folder / "run.yaml").read_text())
     del content["prior"]
@@ -737,7 +737,7 @@ def test_a_batch_of_one_run_gives_the_tables_of_that_run(tmp_path):
 @pytest.fixture(scope="module")
 def three_cameras(tmp_path_factory) -> Path:
     """Points of a rig whose third camera sees what the left one sees, with errors of its own."""
-    run_folder = simulate("huo2015", tmp_path_factory.mktemp("three") / "run", seed=3, frames=60, detections_only=True)
+    run_folder = simulate("huo2015", tmp_path_factory.mktemp("three") / "run", seed=3, frames=60, points=True)
     for name, key in (("rig.yaml", "cameras"), ("run.yaml", "cameras")):
         content = yaml.safe_load((run_folder / name).read_text("utf-8"))
         content[key]["third"] = dict(content[key]["left"])
@@ -770,7 +770,7 @@ def test_a_camera_that_moves_so_far_that_its_spots_lose_their_labels_is_named(th
 @pytest.mark.parametrize("shift_px", [0.0, 2.0, 25.0])
 def test_poses_after_a_knock_of_one_of_two_cameras_do_not_use_its_pictures(shift_px, tmp_path):
     """The other camera and the motion give them; they were beyond 10 sigmas, at CHECK or even PASS."""
-    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=90, detections_only=True)
+    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=90, points=True)
     points = pd.read_csv(run_folder / "detections.csv")
     points.loc[(points.camera == "right") & (points.frame >= 45), ["u_px", "v_px"]] += np.array([1.0, -0.6]) * shift_px
     points.to_csv(run_folder / "detections.csv", index=False)
@@ -824,7 +824,7 @@ def test_a_spot_that_never_hits_its_screen_is_a_point_to_check(tmp_path):
 
 def test_the_point_of_two_spots_that_have_merged_does_not_shift_the_poses(tmp_path):
     """A second laser beside the first one: the table has one point between both, and states the sigma of a spot."""
-    run_folder = simulate("huo2015", tmp_path / "run", seed=6, frames=60, detections_only=True)
+    run_folder = simulate("huo2015", tmp_path / "run", seed=6, frames=60, points=True)
     rig = yaml.safe_load((run_folder / "rig.yaml").read_text("utf-8"))
     name, beam = next(iter(rig["target"]["beams"].items()))
     direction = np.add(beam["direction"], [0.0, 0.0, 0.0015])

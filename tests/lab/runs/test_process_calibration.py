@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import datetime
 
@@ -19,13 +18,14 @@ from lab.findings.finding import Level
 from lab.runs.batch.batch import process_batch
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tests.lab.tables import rows_of
 
 DAY = datetime.date(2026, 3, 14)
 
 
 @pytest.fixture
 def run_folder(tmp_path):
-    return simulate("smooth", tmp_path / "run", seed=5, frames=10, detections_only=True)
+    return simulate("smooth", tmp_path / "run", seed=5, frames=10, points=True)
 
 
 def change_rig(run_folder, **changes):
@@ -53,8 +53,7 @@ def test_the_calibrations_covariance_is_in_its_own_table_and_in_the_total(run_fo
     # A principal point with a sigma of 1 px outweighs spots with a sigma of 0.1 px.
     variances, alone = (np.diagonal(p.covariance, axis1=1, axis2=2) for p in (poses, plain))
     assert np.all(variances > 2 * alone)
-    with (tmp_path / "with" / "systematic.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "with" / "systematic.csv")
     assert len(rows) == 10
     assert float(rows[0]["c00"]) == pytest.approx(poses.systematic[0, 0, 0])
     report = (tmp_path / "with" / "report.html").read_text()
@@ -87,7 +86,7 @@ def test_the_day_of_the_recording_counts_where_the_run_states_it(run_folder, tmp
 
 
 def test_a_batch_with_an_expired_calibration_ends_with_status_3(run_folder, tmp_path):
-    good = simulate("smooth", tmp_path / "good", seed=6, frames=8, detections_only=True)
+    good = simulate("smooth", tmp_path / "good", seed=6, frames=8, points=True)
     change_rig(
         run_folder,
         calibration=CalibrationState(date=DAY, verdict="FAIL", valid_until=None, reasons=("the stand did not roll",)),
@@ -125,7 +124,7 @@ def test_a_prior_that_the_first_pose_contradicts_is_a_reason_of_the_verdict(tmp_
 
     rank: among the reasons. The prior, or the pose, is wrong: the second scenario's poses contradict the truth.
     """
-    run_folder = simulate(scenario, tmp_path / "run", seed=5, frames=60, detections_only=True)
+    run_folder = simulate(scenario, tmp_path / "run", seed=5, frames=60, points=True)
     assert process_run(run_folder, tmp_path / "right").verdict.status == "pass"
     content = yaml.safe_load((run_folder / "run.yaml").read_text("utf-8"))
     at = content["prior"]["position_m"]

@@ -7,11 +7,10 @@ import re
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 
-from cli import main
 from lab.runs.run_log import LOGGER, RunLog, listening
 from lab.simulate.write import simulate
+from tests.lab.command import typed
 from tests.lab.run_folders import write_run
 
 LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (INFO|WARNING|ERROR) +(.+)")
@@ -19,11 +18,7 @@ LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (INFO|WARNING|ERROR) 
 
 @pytest.fixture(scope="module")
 def points(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulate("smooth", tmp_path_factory.mktemp("log") / "run", seed=5, frames=6, detections_only=True)
-
-
-def typed(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(main, [str(a) for a in arguments])
+    return simulate("smooth", tmp_path_factory.mktemp("log") / "run", seed=5, frames=6, points=True)
 
 
 def lines(out: Path) -> list[tuple[str, str]]:

@@ -17,6 +17,7 @@ from lab.files.text import columns
 from lab.runs.frames.pipeline import FrameRecord
 from lab.runs.tables import TableWriter, csv_word, pose_numbers
 from tests.geometry.scenes import paper_rig, random_pose
+from tests.lab.tables import rows_of
 from tracking.detections import Detections
 from tracking.statuses import MotionEstimate, PoseStatus, SpotStatus, TrackedFrame
 
@@ -63,7 +64,7 @@ def written(tmp_path, *records: FrameRecord, rig=RIG) -> dict[str, list[dict[str
     with TableWriter(tmp_path, rig) as tables:
         for record in records:
             tables.write(record)
-    return {name: list(csv.DictReader((tmp_path / name).open(newline=""))) for name in HEADERS}
+    return {name: rows_of(tmp_path / name) for name in HEADERS}
 
 
 def number(text: str) -> float:
@@ -215,10 +216,10 @@ def test_the_causal_pass_has_its_own_tables_with_the_same_columns(tmp_path):
         plain, causal = ((tmp_path / f"{name}{which}.csv").read_text().splitlines() for which in ("", "_causal"))
         assert plain[0] == causal[0]
         assert {line.count(",") for line in plain + causal} == {plain[0].count(",")}
-    rows = list(csv.DictReader((tmp_path / "attitude_causal.csv").open(newline="")))
+    rows = rows_of(tmp_path / "attitude_causal.csv")
     assert [r["status"] for r in rows] == ["measured", "lost"]
     assert float(rows[0]["x_m"]) == pytest.approx(in_causal_pass[0].tracked.pose.translation[0], rel=1e-9)
-    (row,) = csv.DictReader((tmp_path / "covariance_causal.csv").open(newline=""))
+    (row,) = rows_of(tmp_path / "covariance_causal.csv")
     assert float(row["c00"]) == pytest.approx(in_causal_pass[0].tracked.pose_covariance[0, 0], rel=1e-9)
 
 

@@ -7,15 +7,14 @@ import re
 import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from lab.commands import setup
 from lab.errors import InputError
 from lab.files.rig.rig_file import load_rig
 from lab.runs.input_check import check
 from lab.runs.process import process_run
 from lab.setup.init import Layout, rig_of, start
+from tests.lab.command import typed
 from tests.marks import further_slow
 
 LAYOUTS = [
@@ -133,7 +132,7 @@ def own_arguments(folder, screens=(WALL, CEILING), cameras=(FRONT, UP), beams=BE
 
 
 def test_a_rig_of_ones_own_is_what_was_measured_and_says_and_draws_it(tmp_path):
-    done = CliRunner().invoke(main, own_arguments(tmp_path / "lab"), prog_name="beampose")
+    done = typed(*own_arguments(tmp_path / "lab"))
     assert done.exit_code == 0, done.output
     assert "screen wall: 4 x 3 m, middle at (0, 2.5, 1.5) m, normal (0, -1, 0)" in done.output
     assert (
@@ -172,7 +171,7 @@ def test_questions_in_plain_words_give_the_same_rig_as_options(monkeypatch, tmp_
         "C", "0 0 0", "0.25 0.1 1", "ceiling", "wall",
     ]  # fmt: skip
     arguments = ["init", str(tmp_path / "asked"), "--own"]
-    done = CliRunner().invoke(main, arguments, input="\n".join(answers) + "\n", prog_name="beampose")
+    done = typed(*arguments, input="\n".join(answers) + "\n")
     assert done.exit_code == 0, done.output
     assert "expected 3 numbers, got '-2 2.5 x'; wall: the next corner along its height, x y z in m" in done.output
     assert "'wal' is none of wall, ceiling; front: the screen that it films" in done.output
@@ -182,7 +181,7 @@ def test_questions_in_plain_words_give_the_same_rig_as_options(monkeypatch, tmp_
     look_at = "{eye_m: [0.5,0.5,0.2], target_m: [0.5,0.5,3], up: [0,1,0]}"
     up = f"up={{screen: ceiling, look_at: {look_at}, field_of_view_deg: 70}}"
     beams = [BEAMS[0], "C={points_m: [[0,0,0],[0.25,0.1,1]], plus: ceiling, minus: wall}"]
-    done = CliRunner().invoke(main, own_arguments(tmp_path / "given", (WALL, ceiling), (FRONT, up), beams))
+    done = typed(*own_arguments(tmp_path / "given", (WALL, ceiling), (FRONT, up), beams))
     assert done.exit_code == 0, done.output
     assert (tmp_path / "asked/rig.yaml").read_text() == (tmp_path / "given/rig.yaml").read_text()
     ends = [(spot.beam, spot.sign, spot.screen) for spot in asked.spots.values()]
@@ -211,7 +210,7 @@ def test_questions_in_plain_words_give_the_same_rig_as_options(monkeypatch, tmp_
     ],
 )
 def test_a_mistake_in_a_part_names_its_place(tmp_path, change, words):
-    done = CliRunner().invoke(main, own_arguments(tmp_path / "lab", **change), prog_name="beampose")
+    done = typed(*own_arguments(tmp_path / "lab", **change))
     assert done.exit_code == 2
     assert words in done.output
     assert not (tmp_path / "lab").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from dataclasses import replace
 
@@ -29,10 +28,13 @@ from lab.setup.plan_findings import (
     worst_first,
 )
 from tests.geometry.scenes import LENSES, paper_rig
+from tests.lab.tables import rows_of
 
 SMALL = PlanOptions(
-    x_m=Range(-0.1, 0.1, 3), y_m=Range(-0.1, 0.1, 3), z_m=Range(0.1, 0.1, 1),
-    yaw_deg=Range(-4, 4, 3), pitch_deg=Range(-6, 6, 3), roll_deg=Range(-5, 5, 2),
+    {
+        "x_m": Range(-0.1, 0.1, 3), "y_m": Range(-0.1, 0.1, 3), "z_m": Range(0.1, 0.1, 1),
+        "yaw_deg": Range(-4, 4, 3), "pitch_deg": Range(-6, 6, 3), "roll_deg": Range(-5, 5, 2),
+    }
 )  # fmt: skip
 NO_ERRORS = ExpectedErrors(
     focal_relative=0, centre_px=0, distortion_px=0, dot_px=1e-9, dot_survey_m=0, screen_position_m=0,
@@ -40,15 +42,14 @@ NO_ERRORS = ExpectedErrors(
 )  # fmt: skip
 
 
+def over(**ranges):
+    return replace(SMALL, stated={**SMALL.stated, **ranges})
+
+
 @pytest.fixture
 def rig_path(tmp_path):
     save_rig(paper_rig(LENSES[5], size_m=(4.0, 3.0)), tmp_path / "rig.yaml")
     return tmp_path / "rig.yaml"
-
-
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_a_plan_is_two_tables_and_a_page(rig_path, tmp_path):
@@ -103,7 +104,7 @@ def test_without_calibration_errors_the_sigmas_are_those_of_the_pose_solver(rig_
 
 
 def test_the_variances_of_contributions_and_of_parts_of_the_rig_add_up(rig_path):
-    plan = plan_of(rig_path, replace(SMALL, x_m=Range(0, 0, 1), y_m=Range(0, 0, 1), yaw_deg=Range(7, 7, 1),
+    plan = plan_of(rig_path, over(x_m=Range(0, 0, 1), y_m=Range(0, 0, 1), yaw_deg=Range(7, 7, 1),
                                      pitch_deg=Range(3, 3, 1), roll_deg=Range(0, 0, 1)))  # fmt: skip
     np.testing.assert_allclose((plan.parts**2).sum(axis=1), plan.sigma**2, rtol=1e-6)
     for k, group in enumerate(plan.contributors):
@@ -161,7 +162,7 @@ def test_strongly_correlated_groups_are_combined_into_one_line(rig_path):
 
 
 def test_unobservable_poses_are_reported(rig_path, tmp_path):
-    wide = replace(SMALL, yaw_deg=Range(-80, 80, 9))
+    wide = over(yaw_deg=Range(-80, 80, 9))
     found = findings(plan_of(rig_path, wide))
     assert found[0].level in (Level.WARN, Level.FAIL)
     assert "are not observable" in found[0].what
@@ -176,7 +177,7 @@ def test_unobservable_poses_are_reported(rig_path, tmp_path):
 
 
 def test_a_rig_that_sees_nothing_of_the_range_fails(rig_path, tmp_path):
-    away = replace(SMALL, z_m=Range(40, 41, 2))
+    away = over(z_m=Range(40, 41, 2))
     outcome = plan_rig(rig_path, tmp_path / "plan", away)
     assert (outcome.level, outcome.result.measured.mean(), outcome.exit_status) == (Level.FAIL, 0.0, 4)
     page = (tmp_path / "plan" / "report.html").read_text()
@@ -204,13 +205,13 @@ def test_close_spots_have_a_warning(rig_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"yaw_deg": Range(10, -10, 3)}, "yaw_deg: expected the first end below the last, got 10 and -10"),
-        ({"x_m": Range(0, np.nan, 3)}, "x_m: expected finite ends"),
-        ({"x_m": Range(0, 1, 0)}, "x_m: expected a count of 1 or more, got 0"),
+        ({"stated": {"yaw_deg": Range(10, -10, 3)}}, "yaw_deg: expected the first end below the last, got 10 and -10"),
+        ({"stated": {"x_m": Range(0, np.nan, 3)}}, "x_m: expected finite ends"),
+        ({"stated": {"x_m": Range(0, 1, 0)}}, "x_m: expected a count of 1 or more, got 0"),
         ({"sigma_px": 0.0}, "sigma_px: expected a number above 0, got 0"),
         ({"goal_m": -1.0}, "goal_m: expected a number of 0 or more, got -1"),
         ({"expected": ExpectedErrors(centre_px=-1)}, "expected.centre_px: expected a number of 0 or more, got -1"),
-        ({"x_m": Range(0, 1, 1000), "y_m": Range(0, 1, 1000)}, "expected at most 100000 poses"),
+        ({"stated": {"x_m": Range(0, 1, 1000), "y_m": Range(0, 1, 1000)}}, "expected at most 100000 poses"),
     ],
 )
 def test_invalid_options_are_refused(options, words):
@@ -229,7 +230,7 @@ def test_nothing_is_written_for_an_invalid_rig_or_into_another_folder(rig_path, 
     with pytest.raises(InputError, match="the folder holds something other than earlier results"):
         plan_rig(rig_path, tmp_path / "mine", SMALL)
     plan_rig(rig_path, tmp_path / "plan", SMALL)
-    plan_rig(rig_path, tmp_path / "plan", replace(SMALL, roll_deg=Range(0, 0, 1)))  # an earlier plan is replaced
+    plan_rig(rig_path, tmp_path / "plan", over(roll_deg=Range(0, 0, 1)))  # an earlier plan is replaced
     assert len(rows_of(tmp_path / "plan" / "plan.csv")) == 81
 
 
@@ -252,7 +253,7 @@ def test_the_axes_of_a_smooth_map_are_its_coordinates(across, up, rig_path):
         for i, end in ((across, column), (up, row)):
             name, r = ranges[i]
             place[name] = Range(*2 * (r.values()[end],), 1)
-        alone = plan_of(rig_path, replace(SMALL, **place))
+        alone = plan_of(rig_path, over(**place))
         np.testing.assert_allclose(values[row, column], alone.worst[0], rtol=1e-9)
     assert abs(values[0, -1, 1] / values[-1, 0, 1] - 1) > 1e-4  # otherwise swapped axes would pass
 

@@ -14,14 +14,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from click.testing import CliRunner
 
 from bench import refine as bench
 from bench.mistakes.mistakes import CASES, read, turned_aside, write
 from bench.mistakes.recordings import calibrated
 from bench.random_scenes.scene import random_scene
 from bench.random_scenes.write_folder import write_run_folder
-from cli import main
 from geometry.arrays import Array
 from geometry.camera import Camera
 from geometry.forward_model import SpotModel
@@ -41,6 +39,7 @@ from lab.runs.process import process_run
 from lab.runs.setup_check import SampledFrames, compared_with_mistakes, frames_of
 from lab.simulate.scenarios import fan, unequal_fan
 from lab.simulate.write import simulate
+from tests.lab.command import typed
 from tests.lab.run_folders import edit, write_run
 from tests.marks import further_slow
 from tracking.detections import Detections
@@ -57,7 +56,7 @@ def recording(tmp_path_factory) -> Path:
     """Points of a rig whose cameras differ as calibrated ones do; its truth is kept elsewhere."""
     folder = tmp_path_factory.mktemp("recording")
     save_rig(calibrated(unequal_fan(), 1), folder / "rig.yaml")
-    run = simulate("huo2015", folder / "run", seed=1, frames=FRAMES, detections_only=True, rig=folder / "rig.yaml")
+    run = simulate("huo2015", folder / "run", seed=1, frames=FRAMES, points=True, rig=folder / "rig.yaml")
     (run / "truth").rename(folder / "truth")
     return run
 
@@ -66,7 +65,7 @@ def recording(tmp_path_factory) -> Path:
 def symmetric(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("symmetric")
     save_rig(fan(), folder / "rig.yaml")
-    return simulate("huo2015", folder / "run", seed=1, frames=FRAMES, detections_only=True, rig=folder / "rig.yaml")
+    return simulate("huo2015", folder / "run", seed=1, frames=FRAMES, points=True, rig=folder / "rig.yaml")
 
 
 @pytest.fixture
@@ -516,7 +515,7 @@ def test_the_size_of_a_picture_shows_the_mistake(tmp_path, size, words):
     text, status = checked(run)
     assert status == 2
     assert words in text
-    processed = CliRunner().invoke(main, ["run", str(run), "--out", str(tmp_path / "out")])
+    processed = typed("run", run, "--out", tmp_path / "out")
     assert processed.exit_code == 4
     assert f"camera left has no usable picture at all (wrong size {size[0]}x{size[1]}," in processed.stdout
 
@@ -563,7 +562,7 @@ def test_the_one_spot_of_a_camera_that_stays_in_a_corner_is_not_cropped(tmp_path
 def test_a_mistake_is_named_at_rest_without_a_false_point(tmp_path, name):
     save_rig(calibrated(unequal_fan(), 1), tmp_path / "rig.yaml")
     run = simulate(
-        "static", tmp_path / "run", seed=1, frames=FRAMES, detections_only=True, rig=tmp_path / "rig.yaml", clutter=0.0
+        "static", tmp_path / "run", seed=1, frames=FRAMES, points=True, rig=tmp_path / "rig.yaml", clutter=0.0
     )
     (run / "truth").rename(tmp_path / "truth")
     outcome = process_run(with_mistake(name, run, tmp_path / "wrong"), tmp_path / "out")
@@ -596,7 +595,7 @@ def test_spots_that_are_hidden_in_one_of_two_pictures_are_no_wrong_numbers(tmp_p
 
 
 def test_at_rest_only_the_first_and_last_number_show_a_camera_that_is_numbered_from_one(tmp_path):
-    run = simulate("static", tmp_path / "run", seed=1, frames=12, detections_only=True)
+    run = simulate("static", tmp_path / "run", seed=1, frames=12, points=True)
     text, status = checked(with_mistake("numbered from 1, one camera", run, tmp_path / "wrong"))
     assert status == 0
     assert "have 12 frames each, numbered from 1 and from 0" in text
@@ -635,7 +634,7 @@ def test_a_beam_that_has_moved_is_not_one_whose_ends_are_exchanged(try_only, wro
 @pytest.mark.parametrize(("seed", "lamps"), further_slow([(0, (39, 20)), (4, (34, 28)), (7, (42, 20)), (10, (36, 28))]))
 def test_a_spot_that_no_picture_shows_among_lamps_leaves_right_poses_and_no_mistake(tmp_path, seed, lamps):
     """The only spot of a camera is off, and lamps brighter than the spots stay where they are in both cameras."""
-    run = simulate("four-skew-beams", tmp_path / "run", seed=seed, frames=30, detections_only=True)
+    run = simulate("four-skew-beams", tmp_path / "run", seed=seed, frames=30, points=True)
     rig = run / "rig.yaml"
     rig.write_text("".join(s for s in rig.read_text().splitlines(keepends=True) if not re.match(r"\s+'[13]':", s)))
     table = pd.read_csv(run / "detections.csv")

@@ -85,7 +85,7 @@ def test_a_camera_without_labels_says_nothing_about_its_pictures(try_only):
 
 def exchanged(folder: Path, *, truth: bool) -> Path:
     """A recording whose rig.yaml is off by its sigmas, and has the cameras in each other's place."""
-    run = simulate("unequal-fan", folder / "run", seed=3, frames=60, detections_only=True, clutter=0.0)
+    run = simulate("unequal-fan", folder / "run", seed=3, frames=60, points=True, clutter=0.0)
     if not truth:
         shutil.rmtree(run / "truth")
     true = load_run(run).rig
@@ -124,7 +124,7 @@ def test_mirrored_pictures_are_named_although_other_labels_give_poses(tmp_path, 
 
     Pictures of both cameras were twice as large, as far as the search knew.
     """
-    run = simulate("smooth", tmp_path / "run", seed=seed, frames=60, detections_only=True, clutter=0.0)
+    run = simulate("smooth", tmp_path / "run", seed=seed, frames=60, points=True, clutter=0.0)
     shutil.rmtree(run / "truth")
     known = bench.drawn_rig(np.random.default_rng([seed, 7]), load_run(run).rig, MIRROR_SIGMAS)
     save_rig(RigFile(known, covariance_blocks(bench.rig_covariance(known, MIRROR_SIGMAS))), run / "rig.yaml")

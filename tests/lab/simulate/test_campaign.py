@@ -187,7 +187,7 @@ def test_a_campaign_and_a_recording_of_a_rig_of_your_own(tmp_path):
     folder = simulate_calibration(tmp_path / "campaign", rig=str(designed), positions=4)
     assert set(load_project(folder).cameras) == set(load_rig(designed).cameras)
     true = folder / "truth" / "rig.yaml"
-    run = simulate("small-motion", tmp_path / "run", frames=3, detections_only=True, rig=true, known_rig=designed)
+    run = simulate("small-motion", tmp_path / "run", frames=3, points=True, rig=true, known_rig=designed)
     np.testing.assert_allclose(load_rig(run / "rig.yaml").beams["A"].direction, load_rig(designed).beams["A"].direction)
     assert not np.allclose(load_rig(true).beams["A"].direction, load_rig(designed).beams["A"].direction, atol=1e-6)
 

@@ -61,7 +61,7 @@ def test_a_rig_sees_all_its_spots_at_the_middle_of_its_view_wherever_it_stands(n
 )
 def test_a_scenario_is_recorded_by_a_rig_that_stands_elsewhere(name, scenario, tmp_path):
     save_rig(elsewhere(name, seed=3), tmp_path / "own.yaml")
-    folder = simulate(scenario, tmp_path / "run", frames=40, detections_only=True, rig=tmp_path / "own.yaml", clutter=0)
+    folder = simulate(scenario, tmp_path / "run", frames=40, points=True, rig=tmp_path / "own.yaml", clutter=0)
     truth = load_truth(folder)
     in_view = truth.spots.in_view.reshape(40, -1)
     assert in_view[0].all()
@@ -72,8 +72,8 @@ def test_a_scenario_is_recorded_by_a_rig_that_stands_elsewhere(name, scenario, t
 
 @pytest.mark.parametrize("name", ["smooth", "four-skew-beams"])
 def test_a_rig_that_allows_the_scenario_as_it_is_keeps_it(name, tmp_path):
-    own = simulate(name, tmp_path / "own", seed=4, frames=5, detections_only=True)
-    again = simulate(name, tmp_path / "again", seed=4, frames=5, detections_only=True, rig=own / "rig.yaml")
+    own = simulate(name, tmp_path / "own", seed=4, frames=5, points=True)
+    again = simulate(name, tmp_path / "again", seed=4, frames=5, points=True, rig=own / "rig.yaml")
     one, two = files_of(own), files_of(again)
     del one["rig.yaml"], two["rig.yaml"]  # directions are scaled to length 1 once more
     assert one == two
@@ -96,12 +96,12 @@ def test_a_recording_along_a_trajectory_has_its_poses_its_rate_and_its_length(tm
         np.stack([0.1 * t, 0.05 * np.sin(9 * t), 0 * t], -1),
         np.stack([9 * t, 4 * t, -5 * t], -1),
     )
-    folder = simulate("clean", tmp_path / "run", detections_only=True, trajectory=table)
+    folder = simulate("clean", tmp_path / "run", points=True, trajectory=table)
     truth, stated = load_truth(folder).pose, np.loadtxt(table, delimiter=",", skiprows=1)
     assert load_run(folder).frame_rate_hz == pytest.approx(50.0)
     np.testing.assert_allclose(truth.position_m, stated[:, 2:5], rtol=0, atol=1e-11)
     np.testing.assert_allclose(np.abs(np.sum(truth.quaternion_wxyz * stated[:, 5:], axis=1)), 1.0, rtol=0, atol=1e-11)
-    twice = simulate("clean", tmp_path / "twice", detections_only=True, trajectory=table, frame_rate_hz=100.0)
+    twice = simulate("clean", tmp_path / "twice", points=True, trajectory=table, rate_hz=100.0)
     assert len(load_truth(twice).pose.frame) == 81
 
 
@@ -109,7 +109,7 @@ def test_a_trajectory_that_leaves_the_view_says_when_and_which_spot(tmp_path):
     t = np.linspace(0, 1, 21)
     table = poses(tmp_path / "away.csv", np.zeros((21, 3)), np.stack([60 * t, 0 * t, 0 * t], -1))
     lines: list[str] = []
-    simulate("clean", tmp_path / "run", detections_only=True, trajectory=table, note=lines.append)
+    simulate("clean", tmp_path / "run", points=True, trajectory=table, note=lines.append)
     assert lines
     truth = load_truth(tmp_path / "run").spots
     rig = load_rig(tmp_path / "run" / "rig.yaml")
@@ -123,7 +123,7 @@ def test_a_trajectory_that_leaves_the_view_says_when_and_which_spot(tmp_path):
 def test_a_camera_whose_screen_no_beam_meets_shows_an_empty_picture(tmp_path):
     turns = [0.0, 45.0, 90.0, 135.0]
     table = poses(tmp_path / "away.csv", np.zeros((4, 3)), np.stack([turns, [0.0] * 4, [0.0] * 4], -1))
-    folder = simulate("clean", tmp_path / "run", picture_scale=0.25, trajectory=table)
+    folder = simulate("clean", tmp_path / "run", scale=0.25, trajectory=table)
     lit = [
         {int(cv2.imread(str(p), cv2.IMREAD_UNCHANGED).max()) > 60 for p in folder.rglob(f"*{k:04d}.png")}
         for k in range(4)
@@ -140,10 +140,10 @@ def test_a_camera_whose_screen_no_beam_meets_shows_an_empty_picture(tmp_path):
 )
 def test_what_cannot_be_simulated_is_one_line(change, words, tmp_path):
     with pytest.raises(InputError, match=words):
-        simulate("clean", tmp_path / "run", frames=3, detections_only=True, **change)
+        simulate("clean", tmp_path / "run", frames=3, points=True, **change)
 
 
 def test_a_trajectory_nobody_sees_says_where_the_rig_sees_the_vehicle(tmp_path):
     table = poses(tmp_path / "far.csv", np.full((5, 3), 90.0), np.zeros((5, 3)))
     with pytest.raises(InputError, match=r"far.csv: no spot is in any picture .* at \(0, 0, 0\) m"):
-        simulate("clean", tmp_path / "run", detections_only=True, trajectory=table)
+        simulate("clean", tmp_path / "run", points=True, trajectory=table)

@@ -1,6 +1,5 @@
 """Simulated run folders agree with their scene."""
 
-import csv
 import itertools
 from dataclasses import replace
 
@@ -19,9 +18,10 @@ from lab.simulate.points import simulate_points
 from lab.simulate.scenarios import LIGHTS, SCENARIOS, Clutter, Light, Occlusion
 from lab.simulate.scene import compose
 from lab.simulate.write import simulate
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
 
-SMALL = {"picture_scale": 0.25}
+SMALL = {"scale": 0.25}
 
 
 def files_of(folder):
@@ -69,8 +69,7 @@ def test_faults_are_in_the_frames_of_the_scenario(tmp_path):
     assert cut[-12:] != whole[-12:]  # a PNG ends with its IEND chunk
     assert len(cut) < 0.7 * len(whole)
     assert cv2.imread(str(folder / "frames" / "left" / "000055.png"), -1).shape == (128, 160)
-    with (folder / "truth" / "spots.csv").open() as file:
-        assert {int(row["frame"]) for row in csv.DictReader(file)} == set(range(57))
+    assert {int(row["frame"]) for row in rows_of(folder / "truth" / "spots.csv")} == set(range(57))
 
 
 def test_a_video_contains_the_pictures_without_loss(tmp_path):
@@ -86,7 +85,7 @@ def test_a_video_contains_the_pictures_without_loss(tmp_path):
 
 
 def test_written_detections_are_those_of_simulate_points(tmp_path):
-    folder = simulate("huo2015", tmp_path / "run", seed=5, frames=20, detections_only=True, noise_px=0.3)
+    folder = simulate("huo2015", tmp_path / "run", seed=5, frames=20, points=True, noise_px=0.3)
     run = simulate_points("huo2015", 5, frames=20, noise_px=0.3)
     table = read_detections(folder / "detections.csv")
     for k, (c, name) in itertools.product(range(20), enumerate(run.model.camera_names)):
@@ -209,15 +208,15 @@ def test_existing_files_are_never_overwritten(tmp_path):
     ("arguments", "words"),
     [
         ({"light": "dim"}, r"light: expected one of lab, .*got 'dim'"),
-        ({"video": True, "detections_only": True}, "a video or points, not both"),
+        ({"video": True, "points": True}, "a video or points, not both"),
         ({"scenario": "damaged", "video": True}, "which a video cannot contain"),
         ({"light": "deep", "video": True}, "8-bit"),
-        ({"picture_scale": 0.0}, "picture_scale: expected 0.05 to 4, got 0"),
+        ({"scale": 0.0}, "scale: expected 0.05 to 4, got 0"),
     ],
 )
 def test_invalid_arguments_are_rejected_and_nothing_is_written(arguments, words, tmp_path):
     with pytest.raises(InputError, match=words):
-        simulate(**{"scenario": "huo2015", "out_folder": tmp_path / "run", "frames": 1, **arguments})
+        simulate(**{"scenario": "huo2015", "out": tmp_path / "run", "frames": 1, **arguments})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -233,19 +232,19 @@ def test_the_run_file_contains_the_prior_and_the_summary(tmp_path):
 
 def test_the_run_folder_of_a_given_rig_contains_its_calibration(tmp_path):
     """The spots are those of the true rig; the run folder contains its calibration."""
-    true = simulate("clean", tmp_path / "first", seed=1, frames=2, detections_only=True) / "rig.yaml"
+    true = simulate("clean", tmp_path / "first", seed=1, frames=2, points=True) / "rig.yaml"
     rig = load_rig(true)
     off = perturbed_rig(rig, ["cameras.left.fx", "beams.A.direction_y"], np.array([3.0, 1e-3]))
     save_rig(off, tmp_path / "true.yaml")
     folder = simulate(
-        "clean", tmp_path / "run", seed=1, frames=4, detections_only=True, noise_px=0.0, clutter=0.0,
+        "clean", tmp_path / "run", seed=1, frames=4, points=True, noise_px=0.0, clutter=0.0,
         rig=tmp_path / "true.yaml", known_rig=true,
     )  # fmt: skip
     assert load_rig(folder / "rig.yaml").cameras["left"].matrix[0, 0] == rig.cameras["left"].matrix[0, 0]
     (line,) = [line for line in check(folder).lines if "poses and spots agree" in line]
     assert float(line.split()[-2]) > 0.1  # px: the given rig is not the recorded one
     with pytest.raises(InputError, match="keep its size"):
-        simulate("clean", tmp_path / "no", rig=true, picture_scale=0.5)
+        simulate("clean", tmp_path / "no", rig=true, scale=0.5)
     save_rig(load_rig(simulate("four-skew-beams", tmp_path / "x", frames=1) / "rig.yaml"), tmp_path / "four.yaml")
     with pytest.raises(InputError, match=r"four.yaml: expected the cameras and spots of the rig that is recorded"):
         simulate("clean", tmp_path / "no", rig=true, known_rig=tmp_path / "four.yaml")

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
-from cli import main
+from tests.lab.command import typed
 
 SIZE, FRAMES = (320, 240), 40
 
@@ -60,7 +59,7 @@ AGAIN = (12, 20, 21, 33)
 
 def tracked(folder, out):
     arguments = ["track", "point", str(folder), "--detector", "darker", "--out", str(out)]
-    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert typed(*arguments).exit_code == 0
     summary = json.loads((out / "summary.json").read_text())
     return summary, pd.read_csv(out / "track.csv")
 

@@ -3,7 +3,6 @@
 The limits in the asserts are the figures reached, rounded up; the README quotes them.
 """
 
-import csv
 import re
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 
 from bench.real_spots import measured
 from lab.runs.detect.detect import DetectOptions, detect_pictures
+from tests.lab.tables import rows_of
 from tests.paths import DATA
 from tracking.detection.detect import find_spots
 from tracking.detections import Detections
@@ -51,8 +51,8 @@ def centre_of_mass(image: Picture) -> tuple[float, float]:
 def reported(tmp_path: Path, given: list[Path], **overrides: float) -> list[dict[str, float]]:
     """The rows that `beampose detect` writes for files as they are."""
     detect_pictures(given, tmp_path / "out", DetectOptions(overrides={f"detect.{k}": v for k, v in overrides.items()}))
-    with (tmp_path / "out" / "detections.csv").open(newline="") as file:
-        return [{k: float(v) for k, v in row.items() if k != "camera"} for row in csv.DictReader(file)]
+    rows = rows_of(tmp_path / "out" / "detections.csv")
+    return [{k: float(v) for k, v in row.items() if k != "camera"} for row in rows]
 
 
 def places(rows: list[dict[str, float]]) -> np.ndarray:

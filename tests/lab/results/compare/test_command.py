@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from click.testing import CliRunner
 
-from cli import main
+from tests.lab.command import typed
 from tests.lab.results.compare.test_compare import SIMPLE, write_results, write_tum
 from tests.tracking.comparison.motions import recordings
 
@@ -24,7 +23,7 @@ from tests.tracking.comparison.motions import recordings
 )
 def test_a_wrong_option_is_exit_status_2(tmp_path, options, words):
     result = write_results(tmp_path / "one", recordings(1)[0])
-    done = CliRunner().invoke(main, ["compare", str(result), *options])
+    done = typed("compare", result, *options)
     assert done.exit_code == 2
     assert words in done.stderr
 
@@ -33,7 +32,7 @@ def test_a_comparison_without_out_prints_and_writes_nothing(tmp_path):
     mine, theirs = recordings(1)
     result, reference = write_results(tmp_path / "one", mine), write_tum(tmp_path / "other.tum", theirs)
     before = sorted(tmp_path.rglob("*"))
-    done = CliRunner().invoke(main, ["compare", str(result), "--reference", str(reference), "--align", "all"])
+    done = typed("compare", result, "--reference", reference, "--align", "all")
     assert done.exit_code == 0, done.output
     assert "chi-square per degree of freedom" in done.stdout
     assert sorted(tmp_path.rglob("*")) == before
@@ -42,7 +41,7 @@ def test_a_comparison_without_out_prints_and_writes_nothing(tmp_path):
 def test_a_result_is_compared_with_itself_in_readable_numbers(tmp_path):
     """Rounding errors printed thirty zeros."""
     result = write_results(tmp_path / "one", recordings(1)[0])
-    done = CliRunner().invoke(main, ["compare", str(result), str(result)])
+    done = typed("compare", result, result)
     assert done.exit_code == 0, done.output
     assert "chi-square per degree of freedom" in done.stdout
     assert "000000" not in done.stdout
@@ -54,7 +53,7 @@ def test_how_many_frames_are_within_their_limit_is_stated_against_a_reference_al
     one, two = write_results(tmp_path / "one", mine), write_results(tmp_path / "two", mine)
     reference = write_tum(tmp_path / "other.tum", theirs)
     share = "of the frames within the 95 % limit"
-    assert share in CliRunner().invoke(main, ["compare", str(one), "--reference", str(reference)]).stdout
-    done = CliRunner().invoke(main, ["compare", str(one), str(two)])
+    assert share in typed("compare", one, "--reference", reference).stdout
+    done = typed("compare", one, two)
     assert done.exit_code == 0, done.output
     assert share not in done.stdout

@@ -9,9 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from lab.errors import InputError, RunError
 from lab.files.run.results import read_poses
 from lab.report.frames import canvas
@@ -22,6 +20,7 @@ from lab.report.plot.svg import SPOT_COLOURS
 from lab.results.show import show_frame, write_picture, write_video
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tests.lab.command import typed
 from tests.lab.fake_results import make
 from tracking.statuses import PoseStatus, SpotStatus
 
@@ -138,7 +137,7 @@ def test_the_pictures_and_detections_of_the_run_are_shown(tmp_path):
 
 
 def test_a_run_folder_is_processed_up_to_the_frame(tmp_path):
-    run = simulate("huo2015", tmp_path / "run", frames=30, detections_only=True, seed=11)
+    run = simulate("huo2015", tmp_path / "run", frames=30, points=True, seed=11)
     process_run(run, tmp_path / "out", causal=True)
     shown = show_frame(run, 20)
     assert shown.content.pose_words == pose_words(read_poses(tmp_path / "out"), 20)
@@ -160,7 +159,7 @@ def test_a_run_folder_is_processed_up_to_the_frame(tmp_path):
 def test_a_mistake_is_one_line_and_status_2(fake, tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     known = {"r": fake.results, "run": fake.run_folder, "here": tmp_path}
-    done = CliRunner().invoke(main, ["show", *(a.format(**known) for a in arguments)])
+    done = typed("show", *(a.format(**known) for a in arguments))
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
     assert words in done.stderr
     assert list(tmp_path.iterdir()) == []
@@ -217,7 +216,7 @@ def test_where_no_codec_works_nothing_is_left(fake, monkeypatch):
 def test_frames_that_the_results_do_not_have_and_options_without_a_video_are_refused(fake):
     with pytest.raises(InputError, match="--from 500"):
         write_video(fake.results, fake.run_folder, first=500)
-    done = CliRunner().invoke(main, ["report", str(fake.results), "--every", "2"], standalone_mode=True)
+    done = typed("report", fake.results, "--every", "2")
     assert done.exit_code == 2
     assert "add --video" in done.output
 

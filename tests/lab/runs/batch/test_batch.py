@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import html
 import json
 from pathlib import Path
 
 import click
 import pytest
-from click.testing import CliRunner
 
 from cli import main
 from lab.commands.common import command_line
@@ -21,16 +19,13 @@ from lab.runs.batch import task as module
 from lab.runs.batch.batch import BatchOptions, process_batch, read_rows
 from lab.runs.batch.task import COLUMNS
 from lab.simulate.write import simulate
+from tests.lab.command import typed
 from tests.lab.run_folders import write_run
+from tests.lab.tables import rows_of
 
 
 def points_run(folder: Path, seed: int = 5) -> Path:
-    return simulate("smooth", folder, seed=seed, frames=4, detections_only=True)
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    return simulate("smooth", folder, seed=seed, frames=4, points=True)
 
 
 @pytest.fixture(scope="module")
@@ -201,11 +196,11 @@ def test_the_report_of_a_failure_in_the_middle_has_the_lines_of_the_log_until_th
 
 def test_the_summary_has_the_command_and_quiet_shows_nothing_but_errors(tmp_path):
     run, out = points_run(tmp_path / "a"), tmp_path / "out"
-    done = CliRunner().invoke(main, ["batch", str(run), "--out", str(out), "--quiet", "--set", "r1_px=9"])
+    done = typed("batch", run, "--out", out, "--quiet", "--set", "r1_px=9")
     assert (done.stdout, done.stderr, done.exit_code) == ("", "", 0)
     summary = json.loads((out / "a/summary.json").read_text("utf-8"))
     assert summary["command"] == f"beampose batch {run} --out {out} --quiet --set r1_px=9"
-    done = CliRunner().invoke(main, ["batch", str(tmp_path / "none"), "--out", str(out), "--quiet"])
+    done = typed("batch", tmp_path / "none", "--out", out, "--quiet")
     assert (done.stdout, done.stderr.count("\n"), done.exit_code) == ("", 1, 1)
     assert done.stderr.startswith("beampose: none: ERROR: ")
 
@@ -223,10 +218,10 @@ def test_a_long_list_of_runs_is_shortened_in_the_recorded_command():
 
 def test_verbose_shows_the_log_of_each_run_and_excludes_quiet(tmp_path):
     run, out = points_run(tmp_path / "a"), str(tmp_path / "out")
-    done = CliRunner().invoke(main, ["batch", str(run), "--out", out, "-v"])
+    done = typed("batch", run, "--out", out, "-v")
     log = (tmp_path / "out/a/run.log").read_text("utf-8").splitlines()
     assert done.stderr.splitlines() == [f"a: {line}" for line in log]
-    assert CliRunner().invoke(main, ["batch", str(run), "--out", out, "-v", "-q"]).exit_code == 2
+    assert typed("batch", run, "--out", out, "-v", "-q").exit_code == 2
 
 
 def fields(value: object, place: str = "") -> dict[str, object]:

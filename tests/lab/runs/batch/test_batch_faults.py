@@ -64,7 +64,7 @@ def test_unforeseen_errors_are_rows_with_the_places_of_their_tracebacks(tmp_path
 def test_a_full_disk_in_a_table_stops_its_own_run_only(tmp_path):
     """A limit of the size of files has the same effect as a full disk: the write fails in the middle."""
     small = points_run(tmp_path / "small")
-    large = simulate("smooth", tmp_path / "large", seed=5, frames=400, detections_only=True)
+    large = simulate("smooth", tmp_path / "large", seed=5, frames=400, points=True)
     process_batch([small], tmp_path / "first")
     most = max(file.stat().st_size for file in (tmp_path / "first").rglob("*") if file.is_file())
     before = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -119,8 +119,8 @@ def test_a_lost_table_is_written_again_from_the_results(done, tmp_path):
 def recordings(tmp_path_factory):
     """Two runs of points and one of pictures, and their tables from one process."""
     folder = tmp_path_factory.mktemp("recordings")
-    runs = [simulate("smooth", folder / f"p{i}", seed=i, frames=30, detections_only=True) for i in range(2)]
-    runs.append(simulate("smooth", folder / "pictures", seed=9, frames=6, picture_scale=0.25))
+    runs = [simulate("smooth", folder / f"p{i}", seed=i, frames=30, points=True) for i in range(2)]
+    runs.append(simulate("smooth", folder / "pictures", seed=9, frames=6, scale=0.25))
     assert process_batch(runs, folder / "expected").exit_status in (0, 4)
     return runs, tables(folder / "expected")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 from pathlib import Path
@@ -10,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from cli import main
 from lab.files.run.results import read_poses
 from lab.pictures.picture_file import DROPPED, MissingPicture
 from lab.results.certificate import CLOCKS, certificate
 from lab.runs.frames.frames import FoundPoints
 from lab.simulate.write import simulate
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tracking.detections import Detections
 
 FRAMES, SEED = 80, 3
@@ -27,13 +27,13 @@ LATE_S, ROW_TIMES_S = 0.013, {"left": 8e-6, "right": 5e-6}  # of the scenario `c
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("clocks") / "run"
-    return simulate("clocks", folder, seed=SEED, frames=FRAMES, detections_only=True)
+    return simulate("clocks", folder, seed=SEED, frames=FRAMES, points=True)
 
 
 @pytest.fixture(scope="module")
 def rest(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("static") / "run"
-    return simulate("static", folder, seed=SEED, frames=60, detections_only=True)
+    return simulate("static", folder, seed=SEED, frames=60, points=True)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def with_cameras(recording: Path, folder: Path, late: str, rows: str = "", left:
 
 
 def run(folder: Path, out: Path) -> Result:
-    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(out), "--quiet"])
+    done = typed("run", folder, "--out", out, "--quiet")
     assert done.exit_code in (0, 4), done.output
     return done
 
@@ -93,8 +93,7 @@ def test_the_report_states_the_numbers_and_the_tables_have_the_estimated_instant
     assert [f["level"] for f in clock_findings(estimated)] == ["PASS"] * 3
     assert "time_offset_s of camera" in (estimated / "report.html").read_text()
     offset = summary(estimated)["parameters"]["clocks"]["right"]["time_offset_s"]
-    with (estimated / "detections.csv").open(newline="") as file:
-        late = {int(r["frame"]): float(r["t_s"]) for r in csv.DictReader(file) if r["camera"] == "right"}
+    late = {int(r["frame"]): float(r["t_s"]) for r in rows_of(estimated / "detections.csv") if r["camera"] == "right"}
     np.testing.assert_allclose([late[k] - k / 100 for k in late], offset, atol=1e-9)
 
 
@@ -149,6 +148,6 @@ def test_points_of_pictures_are_read_again_in_their_order(tmp_path):
 
 
 def test_verify_estimates_the_clocks_again_and_finds_the_same_tables(estimated):
-    done = CliRunner().invoke(main, ["verify", str(estimated)])
+    done = typed("verify", estimated)
     assert done.exit_code == 0, done.output
     assert "SAME: " in done.output

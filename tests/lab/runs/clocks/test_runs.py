@@ -20,6 +20,7 @@ from geometry.pose import Pose
 from lab.files.run.results import read_poses
 from lab.runs.process import process_run
 from lab.simulate.write import simulate
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
 from tracking.smoothing.motion.clocks import DETERMINED
 from tracking.smoothing.motion.interpolation import Interpolation
@@ -33,7 +34,7 @@ FRAMES, SEED = 40, 3
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("clocks") / "run"
-    return simulate("clocks", folder, seed=SEED, frames=FRAMES, detections_only=True)
+    return simulate("clocks", folder, seed=SEED, frames=FRAMES, points=True)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ def attitude_rms_deg(folder: Path) -> float:
 
 
 def test_the_attitude_is_as_accurate_as_with_one_clock(results, tmp_path):
-    simulate("smooth", tmp_path / "run", seed=SEED, frames=FRAMES, detections_only=True)
+    simulate("smooth", tmp_path / "run", seed=SEED, frames=FRAMES, points=True)
     process_run(tmp_path / "run", tmp_path / "out")
     assert attitude_rms_deg(results) < 1.3 * attitude_rms_deg(tmp_path / "out")
 
@@ -80,8 +81,7 @@ def test_without_the_clocks_the_same_recording_fails(recording, tmp_path):
 
 
 def test_detections_have_the_pictures_own_numbers_and_instants(results):
-    with (results / "detections.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(results / "detections.csv")
     assert list(rows[0])[-1] == "t_s"
     late = {int(r["frame"]): float(r["t_s"]) for r in rows if r["camera"] == "right"}
     assert sorted(late) == list(range(FRAMES))

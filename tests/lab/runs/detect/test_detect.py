@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from pathlib import Path
@@ -16,6 +15,7 @@ from lab.files.text import columns
 from lab.runs.detect.detect import SHEET, DetectOptions, detect_pictures
 from lab.runs.detect.detect_page import MOST, ContactSheet
 from lab.runs.detect.picture_series import MOST_KEPT, SpotCollection, laser_likeness, matched_snr
+from tests.lab.tables import rows_of
 from tests.tracking.rendering import Scene, Spot, expected
 from tracking.detections import Detections
 
@@ -40,8 +40,7 @@ def write_folder(folder: Path, frames: range, suffix: str = ".png", **options: i
 
 
 def rows(out: Path) -> list[dict[str, str]]:
-    with (out / "detections.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
+    return rows_of(out / "detections.csv")
 
 
 def summary(out: Path) -> dict:

@@ -14,16 +14,15 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
-from cli import main
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.files.rig.rig_file import load_rig
 from lab.pictures.delivery import without_repeats
+from tests.lab.command import typed
 from tests.marks import further_slow
 from tests.tracking.rendering import round_lights
 from tracking.background.camera_motion import CameraMotion, shift_between
@@ -84,10 +83,7 @@ class Unsteady:
 
 def recording(folder: Path, **by_camera: Unsteady) -> tuple[Path, Path]:
     """A run folder with pictures of the cameras left and right, and its truth beside it."""
-    made = CliRunner().invoke(
-        main,
-        ["simulate", "four-skew-beams", "--frames", str(FRAMES), "--scale", "0.5", "--points", "--out", str(folder)],
-    )
+    made = typed("simulate", "four-skew-beams", "--frames", FRAMES, "--scale", "0.5", "--points", "--out", folder)
     assert made.exit_code == 0, made.output
     run = folder / "run.yaml"
     run.write_text(re.sub(r"(left|right):\n +detections: detections.csv", r"\1: {frames: frames/\1}", run.read_text()))
@@ -152,7 +148,7 @@ def nees(out: Path, truth: Path) -> np.ndarray:
 
 def processed(folder: Path, out: Path) -> dict[str, Any]:
     """The summary of a run by the command line."""
-    done = CliRunner().invoke(main, ["run", str(folder), "--out", str(out)])
+    done = typed("run", folder, "--out", out)
     assert done.exit_code == 0, done.output
     return dict(json.loads((out / "summary.json").read_text()))
 

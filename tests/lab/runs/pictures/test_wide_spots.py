@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from geometry.camera import Camera
 from geometry.planes import intersect_plane
 from geometry.rig import Screen
 from lab.files.rig.rig_file import load_rig
+from tests.lab.command import typed
 from tests.marks import further_slow
 
 SIZE, FRAMES, WIDE_PX = (512, 640), 30, 38.0
@@ -42,10 +41,7 @@ def recording(folder: Path, ground: np.ndarray) -> Path:
 
     The ground modulates half of the light that falls on it.
     """
-    made = CliRunner().invoke(
-        main,
-        ["simulate", "four-skew-beams", "--frames", str(FRAMES), "--scale", "0.5", "--points", "--out", str(folder)],
-    )
+    made = typed("simulate", "four-skew-beams", "--frames", FRAMES, "--scale", "0.5", "--points", "--out", folder)
     assert made.exit_code == 0, made.output
     for path in (folder / "rig.yaml", folder / "truth" / "spots.csv"):
         text = path.read_text()
@@ -79,14 +75,14 @@ def recording(folder: Path, ground: np.ndarray) -> Path:
 def test_a_spot_that_is_too_wide_is_named_with_the_value_that_admits_it(tmp_path, ground):
     """Not used, it leaves no wrong pose behind; with the stated value it is measured, and its pose is right."""
     folder = recording(tmp_path / "run", ground)
-    CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "plain")])
+    typed("run", folder, "--out", tmp_path / "plain")
     plain = json.loads((tmp_path / "plain" / "summary.json").read_text())["verdict"]
     codes = {finding["code"] for finding in plain["evidence"]}
     assert "BP-V21" in codes
     assert not codes & {"BP-V20", "BP-M06"}  # the truth contradicts no pose, and no mistake is suspected
     value = re.search(r"--set (detect.max_sigma_px=\d+)", " ".join(plain["reasons"]))
     assert value is not None
-    wide = CliRunner().invoke(main, ["run", str(folder), "--out", str(tmp_path / "wide"), "--set", value[1]])
+    wide = typed("run", folder, "--out", tmp_path / "wide", "--set", value[1])
     assert wide.exit_code == 0, wide.output
     spots = pd.read_csv(tmp_path / "wide" / "spots.csv").merge(
         pd.read_csv(folder / "truth" / "spots.csv"), on=["frame", "camera", "spot"], suffixes=("", "_true")

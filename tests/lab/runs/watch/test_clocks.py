@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
 import threading
 import time
@@ -21,6 +20,7 @@ from lab.runs.watch.live_output import LIVE_TABLE
 from lab.runs.watch.watch import watch_run
 from lab.simulate.write import simulate
 from tests.lab.runs.watch.test_watch import run_of_first_pictures
+from tests.lab.tables import rows_of
 from tracking.detections import Detections
 
 FRAMES, EVERY = 24, 2
@@ -30,7 +30,7 @@ OPTIONS = WatchOptions(idle_s=1.5, timeout_s=5.0)
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A left camera of 100 Hz, and a right one that is 1.3 frames late and takes every second picture."""
-    run = simulate("clocks", tmp_path_factory.mktemp("clocks") / "run", seed=3, frames=FRAMES, picture_scale=0.25)
+    run = simulate("clocks", tmp_path_factory.mktemp("clocks") / "run", seed=3, frames=FRAMES, scale=0.25)
     content = yaml.safe_load((run / "run.yaml").read_text())
     late_s = content["cameras"]["right"].pop("time_offset_s")
     folder = run / "frames/right"
@@ -77,14 +77,9 @@ def watched(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run.parent / "out"
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_the_live_poses_are_the_causal_ones_of_the_finished_run(watched, recorded, tmp_path):
-    causal = rows(run_of_first_pictures(recorded, tmp_path / "causal", causal=True) / "attitude.csv")
-    live = rows(watched / LIVE_TABLE)
+    causal = rows_of(run_of_first_pictures(recorded, tmp_path / "causal", causal=True) / "attitude.csv")
+    live = rows_of(watched / LIVE_TABLE)
     assert len(live) == FRAMES
     assert sum(row["status"] == "measured" for row in live) > FRAMES // 4
     assert [{k: v for k, v in row.items() if k != columns.PICTURES} for row in live] == causal
@@ -97,7 +92,7 @@ def test_the_results_are_those_of_the_finished_run(watched, recorded, tmp_path):
 
 
 def test_a_row_names_the_pictures_that_it_has_used(watched):
-    used = [row[columns.PICTURES].split() for row in rows(watched / LIVE_TABLE)]
+    used = [row[columns.PICTURES].split() for row in rows_of(watched / LIVE_TABLE)]
     assert used[0] == ["left:0"]
     assert used[1] == ["left:1", "right:0"]  # taken 1.3 frames after row 0
     both = [f"left:{k}" for k in range(FRAMES)] + [f"right:{k}" for k in range(FRAMES // EVERY)]

@@ -30,7 +30,7 @@ FRAMES = 40
 def run(tmp_path_factory) -> Path:
     """A run whose cameras are replayed pictures."""
     # At 10 Hz, so that a busy machine keeps up: pictures of frames that are far behind are shown without labels.
-    folder = simulate("smooth", tmp_path_factory.mktemp("run") / "run", seed=3, frames=FRAMES, picture_scale=0.25)
+    folder = simulate("smooth", tmp_path_factory.mktemp("run") / "run", seed=3, frames=FRAMES, scale=0.25)
     content = yaml.safe_load((folder / "run.yaml").read_text())
     content["frame_rate_hz"] = 10.0
     for camera in content["cameras"].values():

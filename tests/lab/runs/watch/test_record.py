@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import errno
 import http.server
@@ -32,6 +31,7 @@ from lab.runs.frames.frames import open_frames
 from lab.runs.watch import record as recording
 from lab.runs.watch.cameras import FrameClock
 from lab.runs.watch.record import RecordOptions, record
+from tests.lab.tables import rows_of
 from tests.paths import ROOT
 
 SIZE = (160, 128)  # of the rig's cameras
@@ -68,8 +68,7 @@ def valid(folder: Path) -> dict[str, list[int]]:
         assert pictures
         assert not [p for p in pictures if isinstance(read_picture(p, SIZE), MissingPicture)]
         out[name] = [int(p.stem) for p in pictures]
-        with (folder / f"times-{name}.csv").open() as file:
-            rows = list(csv.DictReader(file))
+        rows = rows_of(folder / f"times-{name}.csv")
         # A process that is killed may have written a time whose picture is missing: it counts as dropped.
         timed = [int(r["frame"]) for r in rows]
         assert out[name] in (timed, timed[:-1])
@@ -154,8 +153,7 @@ def test_pictures_that_the_camera_loses_leave_gaps_by_its_count_and_by_its_clock
     numbers = valid(tmp_path / "run")
     assert numbers["left"] == kept
     assert "left 27 pictures, 3 lost, 0 not written; right 27 pictures, " in done.lines[0]
-    with (tmp_path / "run" / "times-left.csv").open() as file:
-        t_s = np.array([float(r["t_s"]) for r in csv.DictReader(file)])
+    t_s = np.array([float(r["t_s"]) for r in rows_of(tmp_path / "run" / "times-left.csv")])
     np.testing.assert_allclose(np.diff(t_s), np.diff(times), atol=2e-6)
     assert all(camera.released for camera in cameras.values())
 
@@ -271,8 +269,7 @@ def test_a_video_and_a_video_served_as_a_stream_are_recorded_picture_by_picture(
     assert valid(tmp_path / "run")["left"] == list(range(25))
     for k in (0, 24):
         assert read_picture(tmp_path / "run/frames/left" / f"{k:06d}.png", SIZE)[5, 5] == 3 * k
-    with (tmp_path / "run" / "times-left.csv").open() as file:
-        t_s = [float(r["t_s"]) for r in csv.DictReader(file)]
+    t_s = [float(r["t_s"]) for r in rows_of(tmp_path / "run" / "times-left.csv")]
     if not served:
         np.testing.assert_allclose(t_s, np.arange(25) / 25, atol=1e-6)
     assert ", 0 lost, 0 not written" in done.lines[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 import socket
@@ -33,6 +32,7 @@ from lab.runs.watch.live_output import LIVE_TABLE, Latency
 from lab.runs.watch.watch import watch_run
 from lab.simulate.scenarios import SCENARIOS, Light
 from lab.simulate.write import simulate
+from tests.lab.tables import rows_of
 from tracking.detections import Detections
 
 FRAMES = 24
@@ -43,7 +43,7 @@ PATIENT = WatchOptions(idle_s=60.0, timeout_s=60.0)  # ends when it is stopped; 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulate("smooth", tmp_path_factory.mktemp("recorded") / "run", seed=3, frames=FRAMES, picture_scale=0.25)
+    return simulate("smooth", tmp_path_factory.mktemp("recorded") / "run", seed=3, frames=FRAMES, scale=0.25)
 
 
 def run_of_first_pictures(run: Path, out: Path, causal: bool = False) -> Path:
@@ -109,11 +109,6 @@ def watched(run: Path, out: Path, feeder: Callable[[], None], **options: object)
         thread.join()
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.fixture(scope="module")
 def followed(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict]]:
     """The results of a watched run that is stopped after its last picture, and the lines received by UDP."""
@@ -151,7 +146,7 @@ def test_the_live_table_is_that_of_a_causal_run(followed, recorded, tmp_path):
 
 def test_a_line_of_json_is_sent_for_every_frame(followed):
     out, lines = followed
-    live = rows(out / LIVE_TABLE)
+    live = rows_of(out / LIVE_TABLE)
     assert [line["frame"] for line in lines] == list(range(FRAMES))
     assert [line["status"] for line in lines] == [row["status"] for row in live]
     last, row = lines[-1], live[-1]
@@ -189,13 +184,13 @@ def test_a_watch_that_has_not_kept_up_says_what_became_of_the_pictures(latency, 
 def test_pictures_that_come_faster_than_they_are_searched_wait_for_the_first_background(tmp_path):
     """On a rough screen spots are found in front of a background only: here from the first picture on."""
     rough = replace(SCENARIOS["smooth"], light=Light(texture=0.12, peak_dn=20.0, background_dn=40.0))
-    run = simulate(rough, tmp_path / "run", seed=3, frames=50, picture_scale=0.25)
+    run = simulate(rough, tmp_path / "run", seed=3, frames=50, scale=0.25)
     shown = {}
     for rate_hz in (10.0, 10_000.0):
         text = yaml.safe_load((run / "run.yaml").read_text("utf-8"))
         (run / "run.yaml").write_text(yaml.safe_dump({**text, "frame_rate_hz": rate_hz, "exposure_s": 1e-5}), "utf-8")
         watch_run(run, tmp_path / "out", options=FAST)
-        first = [row for row in rows(tmp_path / "out" / "detections.csv") if int(row["frame"]) < 30]
+        first = [row for row in rows_of(tmp_path / "out" / "detections.csv") if int(row["frame"]) < 30]
         shown[rate_hz] = [sum(row["camera"] == name for row in first) / 30 for name in ("left", "right")]
     assert max(shown[10.0]) < 1.0
     assert min(shown[10_000.0]) > 3.0
@@ -209,7 +204,7 @@ def test_a_camera_that_stops_does_not_stop_the_other(recorded, tmp_path):
         feed(recorded, run, lambda camera, frame: camera == "left" or frame < 10)
 
     watched(run, tmp_path / "out", feeder, options=IMPATIENT)
-    spots = rows(tmp_path / "out/spots.csv")
+    spots = rows_of(tmp_path / "out/spots.csv")
     assert {int(r["frame"]) for r in spots} == set(range(FRAMES))
     assert {r["status"] for r in spots if r["camera"] == "right" and int(r["frame"]) >= 10} == {"no_image"}
     assert all(r["status"] == "matched" for r in spots if r["camera"] == "left" and int(r["frame"]) == FRAMES - 1)
@@ -241,7 +236,7 @@ def test_reprocessed_results_are_those_of_a_run(recorded, tmp_path):
     process_run(recorded, tmp_path / "again")
     for name in ("attitude.csv", "attitude_causal.csv", "detections.csv"):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
-    assert len(rows(tmp_path / "out" / LIVE_TABLE)) == FRAMES
+    assert len(rows_of(tmp_path / "out" / LIVE_TABLE)) == FRAMES
 
 
 def test_stopping_ends_the_recording_and_writes_the_results(followed):
@@ -273,7 +268,7 @@ def test_only_the_live_table_of_a_killed_watch_may_be_replaced(recorded, tmp_pat
 
 
 def test_a_device_with_an_end_has_the_results_of_its_pictures(tmp_path):
-    recorded = simulate("smooth", tmp_path / "video", seed=3, frames=FRAMES, picture_scale=0.25, video=True)
+    recorded = simulate("smooth", tmp_path / "video", seed=3, frames=FRAMES, scale=0.25, video=True)
     content = yaml.safe_load((recorded / "run.yaml").read_text())
     ordinary = run_of_first_pictures(recorded, tmp_path / "ordinary")
     for camera in content["cameras"].values():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from pathlib import Path
@@ -10,11 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from cli import main
 from lab.targets.circle import CIRCLE, DETECTORS, FORMS, CircleOptions, CircleTarget
 from lab.targets.track import track_target
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.tracking.drogue_circle.discs import discs
 
 SIZE = (128, 96)
@@ -49,16 +49,11 @@ def video(path: Path, pictures: list[np.ndarray]) -> Path:
 
 
 def rows(out: Path) -> list[dict[str, str]]:
-    with (out / "circle.csv").open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def typed(*arguments: object) -> Result:
-    return CliRunner().invoke(main, ["track", "circle", *map(str, arguments)])
+    return rows_of(out / "circle.csv")
 
 
 def test_a_folder_of_pictures_gives_all_files(folder, tmp_path):
-    done = typed(folder, "--out", tmp_path / "out", "--rate", 50, "--video")
+    done = typed("track", "circle", folder, "--out", tmp_path / "out", "--rate", 50, "--video")
     assert done.exit_code == 0, done.output
     assert "10 of 12 frames measured" in done.output
     table = rows(tmp_path / "out")
@@ -99,17 +94,17 @@ def test_several_edges_about_one_centre_are_reported_unless_one_is_chosen(tmp_pa
     file = video(
         tmp_path / "ring.avi", [cv2.circle(picture(k), (50 + round(1.5 * k), 45), 40, 20, 3) for k in range(6)]
     )
-    done = typed(file, "--out", tmp_path / "out")
+    done = typed("track", "circle", file, "--out", tmp_path / "out")
     assert "CHECK" in done.output
     assert "edges about one centre" in done.output
     evidence = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["verdict"]["evidence"]
     assert "BP-T06" in {e["code"] for e in evidence}
-    assert "edges about" not in typed(file, "--out", tmp_path / "out", "--edge", "outer").output
+    assert "edges about" not in typed("track", "circle", file, "--out", tmp_path / "out", "--edge", "outer").output
     assert float(rows(tmp_path / "out")[0]["radius_px"]) == pytest.approx(41.5, abs=1.2)
 
 
 def test_a_disc_without_the_chosen_edge_is_not_found_and_the_message_names_the_option(folder, tmp_path):
-    done = typed(folder, "--out", tmp_path / "out", "--edge", "inner")
+    done = typed("track", "circle", folder, "--out", tmp_path / "out", "--edge", "inner")
     assert done.exit_code == 4
     assert "has the target the chosen edge (--edge)" in done.output
 
@@ -129,21 +124,23 @@ def test_without_one_clear_circle_the_quality_gate_fails(tmp_path, circles, caus
     (tmp_path / "pictures").mkdir()
     for k in range(3):
         cv2.imwrite(str(tmp_path / "pictures" / f"{k}.png"), discs(circles, SIZE, seed=k))
-    done = typed(tmp_path / "pictures", "--out", tmp_path / "out")
+    done = typed("track", "circle", tmp_path / "pictures", "--out", tmp_path / "out")
     assert done.exit_code == 4
     assert "no circle was found" in done.output
     table = rows(tmp_path / "out")
     assert {(r["status"], r["cause"], r["u_px"]) for r in table} == {("lost", cause, "")}
     if cause == "ambiguous":
         assert "--near" in done.output
-        assert typed(tmp_path / "pictures", "--out", tmp_path / "out", "--near", 90, 48).exit_code == 0
+        assert (
+            typed("track", "circle", tmp_path / "pictures", "--out", tmp_path / "out", "--near", 90, 48).exit_code == 0
+        )
         assert float(rows(tmp_path / "out")[0]["u_px"]) == pytest.approx(90.0, abs=0.1)
 
 
 def test_a_video_that_is_cut_off_is_tracked_to_its_end(tmp_path):
     whole = video(tmp_path / "whole.avi", [picture(k) for k in range(12)])
     (tmp_path / "cut.avi").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    done = typed(tmp_path / "cut.avi", "--out", tmp_path / "out")
+    done = typed("track", "circle", tmp_path / "cut.avi", "--out", tmp_path / "out")
     if done.exit_code != 2:  # OpenCV may refuse such a file
         table = rows(tmp_path / "out")
         assert 1 <= len(table) < 12
@@ -159,7 +156,7 @@ def test_a_video_that_is_cut_off_is_tracked_to_its_end(tmp_path):
     ],
 )
 def test_a_wrong_option_is_one_plain_line(folder, tmp_path, arguments, words):
-    done = typed(folder, "--out", tmp_path / "out", *arguments)
+    done = typed("track", "circle", folder, "--out", tmp_path / "out", *arguments)
     assert done.exit_code == 2
     assert words in done.output
     assert not (tmp_path / "out").exists()

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from bench.related_measurements.drogue_sequences import moving_drogue
-from cli import main
 from geometry.camera import Camera
 from geometry.pose import Pose
 from lab.targets.drogue import DROGUE, DrogueOptions, DrogueTarget
 from lab.targets.track import track_target
 from studies.drogue.render import render_drogue
 from studies.drogue.scene import PICTURE, SKY, DrogueBackground, DrogueScene
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 
 SIZE, FOCAL = (224, 160), 400.0
 
@@ -68,16 +67,11 @@ def video(path: Path, pictures: list[np.ndarray]) -> Path:
 
 
 def rows(out: Path) -> list[dict[str, str]]:
-    with (out / "drogue.csv").open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def typed(*arguments: object) -> Result:
-    return CliRunner().invoke(main, ["track", "drogue", *map(str, arguments)])
+    return rows_of(out / "drogue.csv")
 
 
 def test_a_folder_of_pictures_gives_all_files(folder, tmp_path):
-    done = typed(folder, "--out", tmp_path / "out", "--rate", 50, "--video")
+    done = typed("track", "drogue", folder, "--out", tmp_path / "out", "--rate", 50, "--video")
     assert done.exit_code == 0, done.output
     assert "12 of 14 frames measured" in done.output
     table = rows(tmp_path / "out")
@@ -127,14 +121,14 @@ def test_without_one_clear_drogue_the_quality_gate_fails(tmp_path):
         (tmp_path / name).mkdir()
         for k in range(3):
             cv2.imwrite(str(tmp_path / name / f"{k}.png"), picture)
-        done = typed(tmp_path / name, "--out", tmp_path / f"out-{name}")
+        done = typed("track", "drogue", tmp_path / name, "--out", tmp_path / f"out-{name}")
         assert done.exit_code == 4, name
         assert "no drogue was found" in done.output
         cause = "ambiguous" if name == "two" else "not_found"
         table = rows(tmp_path / f"out-{name}")
         assert {(r["status"], r["cause"], r["u_px"], r["confidence"]) for r in table} == {("lost", cause, "", "0.0000")}
     assert "--near" in done.output
-    assert typed(tmp_path / "two", "--out", tmp_path / "out-two", "--near", 165, 80).exit_code == 0
+    assert typed("track", "drogue", tmp_path / "two", "--out", tmp_path / "out-two", "--near", 165, 80).exit_code == 0
     assert float(rows(tmp_path / "out-two")[0]["u_px"]) == pytest.approx(165.0, abs=3)
 
 
@@ -142,7 +136,7 @@ def test_without_one_clear_drogue_the_quality_gate_fails(tmp_path):
 def test_of_a_drogue_larger_than_the_picture_no_wrong_place_is_reported(tmp_path, truth):
     for k in range(3):
         cv2.imwrite(str(tmp_path / f"{k}.png"), drogue(*truth, seed=k))
-    done = typed(tmp_path, "--out", tmp_path / "out")
+    done = typed("track", "drogue", tmp_path, "--out", tmp_path / "out")
     places = [(float(r["u_px"]), float(r["v_px"])) for r in rows(tmp_path / "out") if r["status"] == "measured"]
     # The rear end of the basket is a circle too: where it is in view it has the right centre.
     assert all(np.hypot(u - truth[0], v - truth[1]) < truth[2] / 4 for u, v in places)
@@ -159,7 +153,7 @@ def test_of_a_drogue_larger_than_the_picture_no_wrong_place_is_reported(tmp_path
     ],
 )
 def test_a_wrong_option_is_one_message(folder, tmp_path, arguments, words):
-    done = typed(folder, "--out", tmp_path / "out", *arguments)
+    done = typed("track", "drogue", folder, "--out", tmp_path / "out", *arguments)
     assert done.exit_code == 2
     assert words in done.output
     assert not (tmp_path / "out").exists()

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 import json
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from cli import main
 from lab.findings.finding import Level, verdict
 from lab.targets.point import COLUMNS, PointOptions, PointTarget
 from lab.targets.track import track_target
 from studies.duan2020 import compare_duan2020
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 
 FRAMES = 30
 
@@ -45,9 +44,8 @@ def folder(tmp_path_factory):
     return out
 
 
-def rows_of(out):
-    with (out / "track.csv").open() as file:
-        return list(csv.DictReader(file))
+def track_of(out):
+    return rows_of(out / "track.csv")
 
 
 def write_points(path, places, header="frame,u_px,v_px"):
@@ -57,7 +55,7 @@ def write_points(path, places, header="frame,u_px,v_px"):
 
 def test_a_black_target_in_pictures_is_tracked_through_missing_pictures(folder, tmp_path):
     outcome = track_target(PointTarget(PointOptions("darker", rate_hz=50.0, overlay=True)), folder, tmp_path / "out")
-    rows = rows_of(tmp_path / "out")
+    rows = track_of(tmp_path / "out")
     assert [int(r["frame"]) for r in rows] == list(range(FRAMES))
     words = [r["status"] for r in rows]
     assert [k for k, w in enumerate(words) if w != "measured"] == [10, 11, 15, 20]
@@ -97,8 +95,8 @@ def test_a_disc_before_clouds_has_its_own_centre_in_all_frames_in_which_it_is_me
         shown = scene * (1 - cover) + 25 * cover + np.random.default_rng(k).normal(0, 3, u.shape)
         shown = np.clip(shown if detector == "darker" else 255 - shown, 0, 255).round().astype(np.uint8)
         cv2.imwrite(str(source / f"{k:04d}.png"), shown)
-    CliRunner().invoke(main, ["track", "point", str(source), "--out", str(tmp_path / "out"), "--detector", detector])
-    places = {k: (r["u_px"], r["v_px"]) for k, r in enumerate(rows_of(tmp_path / "out")) if r["status"] == "measured"}
+    typed("track", "point", source, "--out", tmp_path / "out", "--detector", detector)
+    places = {k: (r["u_px"], r["v_px"]) for k, r in enumerate(track_of(tmp_path / "out")) if r["status"] == "measured"}
     errors = [np.hypot(float(u) - 2 * path_of(k)[0], float(v) - path_of(k)[1]) for k, (u, v) in places.items()]
     assert len(errors) >= 5
     assert max(errors) < 0.5
@@ -124,26 +122,24 @@ def test_a_plain_table_is_tracked_and_irregular_times_count(tmp_path):
     table.write_text("frame,t_s,u_px,v_px,sigma_u_px,sigma_v_px\n" + "\n".join(lines) + "\n")
     outcome = track_target(PointTarget(), table, tmp_path / "out")
     assert outcome.result.statuses() == {"measured": 57, "predicted": 3, "lost": 0}
-    last = rows_of(tmp_path / "out")[-1]
+    last = track_of(tmp_path / "out")[-1]
     assert float(last["velocity_u_px_s"]) == pytest.approx(100, abs=3)
-    assert tuple(rows_of(tmp_path / "out")[0]) == COLUMNS
+    assert tuple(track_of(tmp_path / "out")[0]) == COLUMNS
 
 
 def test_without_a_frame_rate_there_are_no_seconds(tmp_path):
     table = write_points(tmp_path / "points.csv", {k: path_of(k) for k in range(10)})
     track_target(PointTarget(), table, tmp_path / "out")
-    last = rows_of(tmp_path / "out")[-1]
+    last = track_of(tmp_path / "out")[-1]
     assert (last["t_s"], last["velocity_u_px_s"]) == ("", "")
     assert float(last["velocity_u_px_frame"]) == pytest.approx(1.5, abs=1e-6)
 
 
 def test_a_target_that_is_not_there_is_a_failed_gate_without_positions(folder, tmp_path):
-    done = CliRunner().invoke(
-        main, ["track", "point", str(folder), "--out", str(tmp_path / "out"), "--detector", "brighter"]
-    )
+    done = typed("track", "point", folder, "--out", tmp_path / "out", "--detector", "brighter")
     assert done.exit_code == 4
     assert done.output.startswith("disc: FAIL: 0 of 30 frames measured (no target was found in 30 frames")
-    rows = rows_of(tmp_path / "out")
+    rows = track_of(tmp_path / "out")
     assert {r["status"] for r in rows} == {"lost"}
     assert all(r["u_px"] == r["sigma_u_px"] == r["c00"] == "" for r in rows)
     assert "BP-N01" in (tmp_path / "out" / "report.html").read_text("utf-8")
@@ -178,7 +174,7 @@ def test_a_target_at_rest_before_a_scene_is_ambiguous_until_its_place_is_stated(
     assert "--near" in next(f for f in outcome.findings if f.code == "BP-N01").remedy
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["counts"]["not_measured"]["ambiguous"] == 18
-    assert {r["u_px"] for r in rows_of(tmp_path / "out")} == {""}
+    assert {r["u_px"] for r in track_of(tmp_path / "out")} == {""}
     chosen = track_target(PointTarget(PointOptions(near_px=(205.0, 60.0))), table, tmp_path / "other")
     assert verdict(chosen.findings) is Level.PASS
     assert chosen.result.frames[0].place[0] == pytest.approx(200, abs=0.1)
@@ -199,7 +195,7 @@ def test_a_target_at_rest_before_a_scene_is_ambiguous_until_its_place_is_stated(
 def test_a_table_that_cannot_be_used_is_one_plain_line(tmp_path, text, words):
     table = tmp_path / "points.csv"
     table.write_text(text)
-    done = CliRunner().invoke(main, ["track", "point", str(table), "--out", str(tmp_path / "out")])
+    done = typed("track", "point", table, "--out", tmp_path / "out")
     assert done.exit_code == 2
     assert words in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -217,7 +213,7 @@ def test_a_table_that_cannot_be_used_is_one_plain_line(tmp_path, text, words):
     ],
 )
 def test_an_option_that_cannot_be_used_is_exit_status_2(folder, tmp_path, arguments, words):
-    done = CliRunner().invoke(main, ["track", "point", str(folder), "--out", str(tmp_path / "out"), *arguments])
+    done = typed("track", "point", folder, "--out", tmp_path / "out", *arguments)
     assert done.exit_code == 2
     assert words in done.stderr
 
@@ -260,9 +256,9 @@ def test_a_coloured_target_is_tracked(kind, name, tmp_path):
             shown = np.full((120, 160, 3), 150, np.uint8) if k == 15 else coloured(k)
             cv2.imwrite(str(source / f"{k:04d}.png"), shown)
     arguments = ["track", "point", str(source), "--out", str(tmp_path / "out"), "--detector", "colour", "--colour"]
-    result = CliRunner().invoke(main, [*arguments, name])
+    result = typed(*arguments, name)
     assert result.exit_code == 0, result.output
-    rows = rows_of(tmp_path / "out")
+    rows = track_of(tmp_path / "out")
     assert [k for k, r in enumerate(rows) if r["status"] != "measured"] == [15]
     errors = [np.hypot(*(np.array([float(r["u_px"]), float(r["v_px"])]) - path_of(k))) for k, r in enumerate(rows)]
     assert max(errors) < 0.5
@@ -279,7 +275,7 @@ def test_a_coloured_target_is_tracked(kind, name, tmp_path):
     ],
 )
 def test_a_colour_that_cannot_be_searched_is_one_plain_line(arguments, words, folder, tmp_path):
-    result = CliRunner().invoke(main, ["track", "point", str(folder), "--out", str(tmp_path / "out"), *arguments])
+    result = typed("track", "point", folder, "--out", tmp_path / "out", *arguments)
     assert result.exit_code == 2
     assert words in result.output
     assert len(result.output.strip().splitlines()) == 1
@@ -293,7 +289,7 @@ def test_a_target_of_another_colour_is_lost_and_never_reported(tmp_path):
         cv2.imwrite(str(source / f"{k:04d}.png"), coloured(k))
     options = PointOptions("colour", rate_hz=25.0, colour="blue")
     assert track_target(PointTarget(options), source, tmp_path / "out").exit_status == 4
-    assert {r["status"] for r in rows_of(tmp_path / "out")} == {"lost"}
+    assert {r["status"] for r in track_of(tmp_path / "out")} == {"lost"}
 
 
 @pytest.mark.parametrize(("bits", "shift"), [(8, 0), (10, 0), (12, 0), (12, 4), (14, 0), (16, 0)])
@@ -308,7 +304,7 @@ def test_colours_of_a_sensor_with_fewer_bits_than_its_files_are_found_as_in_8_bi
             cv2.imwrite(str(source / f"{k:04d}.{suffix}"), stored if wide else coloured(k))
         options = PointOptions("colour", rate_hz=25.0, colour="red")
         assert track_target(PointTarget(options), source, tmp_path / f"{name}-out").exit_status == 0
-        found.append([[float(r["u_px"]), float(r["v_px"])] for r in rows_of(tmp_path / f"{name}-out")[3:]])
+        found.append([[float(r["u_px"]), float(r["v_px"])] for r in track_of(tmp_path / f"{name}-out")[3:]])
     np.testing.assert_allclose(found[1], found[0], atol=0.1)
 
 

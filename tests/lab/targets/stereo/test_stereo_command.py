@@ -8,24 +8,20 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
 
 from bench.related_measurements.stereo_checks import STATED, processed, stated_eyes
 from bench.related_measurements.stereo_generator import approach, write_recording
-from cli import main
 from lab.errors import InputError
 from lab.files.text import columns
 from lab.findings.finding import Verdict
 from lab.number_format import decimals_of
 from lab.targets.stereo.process import findings_of, process_stereo_run
 from lab.targets.stereo.simulated_recording import write_stereo_recording
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
 
 FRAMES = 12  # of the recording of points
-
-
-def typed(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments], prog_name="beampose")
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +35,6 @@ def result(drogue, tmp_path_factory):
     return process_stereo_run(drogue, tmp_path_factory.mktemp("results") / "out")
 
 
-def rows(folder, name):
-    with (folder / name).open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def changed(drogue, folder, **fields):
     """A copy of a run folder with other fields in run.yaml; None removes one."""
     shutil.copytree(drogue, folder)
@@ -55,7 +46,7 @@ def changed(drogue, folder, **fields):
 
 def first_frames(run, count, shift=0):
     """Leaves the first frames of a run, those of the right camera with other numbers."""
-    table = [r for r in rows(run, "detections.csv") if int(r["frame"]) < count]
+    table = [r for r in rows_of(run / "detections.csv") if int(r["frame"]) < count]
     with (run / "detections.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, table[0])
         writer.writeheader()
@@ -67,11 +58,11 @@ def test_the_tables_have_the_columns_of_the_contract_and_a_row_per_frame(result)
         ("attitude.csv", columns.ATTITUDE), ("covariance.csv", columns.COVARIANCE), ("spots.csv", columns.SPOTS),
         ("detections.csv", columns.DETECTIONS),
     ):  # fmt: skip
-        assert tuple(rows(result.out, name)[0]) == header
-    attitude = rows(result.out, "attitude.csv")
+        assert tuple(rows_of(result.out / name)[0]) == header
+    attitude = rows_of(result.out / "attitude.csv")
     assert [int(r["frame"]) for r in attitude] == list(range(FRAMES))
     assert {r["status"] for r in attitude} == {"measured"}
-    assert len(rows(result.out, "spots.csv")) == FRAMES * 2 * 7
+    assert len(rows_of(result.out / "spots.csv")) == FRAMES * 2 * 7
 
 
 def test_the_pose_errors_agree_with_the_stated_covariance(result):
@@ -83,7 +74,7 @@ def test_the_pose_errors_agree_with_the_stated_covariance(result):
 
 def test_the_triangulated_points_are_where_the_pose_puts_the_markers(result):
     record = result.result.records[0]
-    points = {r["spot"]: r for r in rows(result.out, "points.csv") if r["frame"] == "0"}
+    points = {r["spot"]: r for r in rows_of(result.out / "points.csv") if r["frame"] == "0"}
     model = result.result.run.target.model
     both = (record.tracked.index >= 0).all(axis=0)
     assert both.sum() > 3
@@ -281,7 +272,7 @@ def test_colour_videos_give_the_markers_that_their_pictures_show(tmp_path):
         content["cameras"][name] = {"frames": path.name}
     (run / "run.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
     done = process_stereo_run(run, tmp_path / "out")
-    assert len(rows(done.out, "detections.csv")) >= 10
+    assert len(rows_of(done.out / "detections.csv")) >= 10
     assert np.abs(done.result.errors.range_m).max() < 0.3
 
 

@@ -1,6 +1,5 @@
 """`beampose track lamps`, as typed: right poses of a renderer that shares no code with it, an honest no, bad input."""
 
-import csv
 import json
 import re
 
@@ -8,15 +7,15 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
 
 from bench.related_measurements.lamps import judged, write_recording
 from bench.related_measurements.renderers.second_renderer import background
-from cli import main
 from geometry.pose import Pose
 from lab.report.page import PageDrawing
 from lab.report.plot.series import Band
 from lab.targets.stereo.page import pose_section
+from tests.lab.command import typed
+from tests.lab.tables import rows_of
 from tests.marks import further_slow
 from tracking.binocular.pose_tracker import BinocularFrame
 from tracking.statuses import PoseStatus
@@ -30,9 +29,9 @@ def recording(tmp_path_factory):
     return folder, statuses, errors
 
 
-def typed(folder, *options, pictures="frames", target="lamps.yaml", camera="camera.yaml"):
+def tracked(folder, *options, pictures="frames", target="lamps.yaml", camera="camera.yaml"):
     given = [folder / pictures, "--target", folder / target, "--camera", folder / camera, "--out", folder / "other"]
-    return CliRunner().invoke(main, ["track", "lamps", *map(str, given), *options])
+    return typed("track", "lamps", *given, *options)
 
 
 def test_the_poses_are_within_the_papers_ten_centimetres_and_one_degree(recording):
@@ -53,8 +52,8 @@ def test_the_summary_and_the_page_state_pose_and_verdict(recording):
 
 def test_harris_corners_give_the_same_motion(recording):
     folder, _, _ = recording
-    assert typed(folder, "--detector", "harris", "--limit", "6").exit_code == 0
-    rows = [list(csv.DictReader((folder / out / "attitude.csv").open())) for out in ("out", "other")]
+    assert tracked(folder, "--detector", "harris", "--limit", "6").exit_code == 0
+    rows = [rows_of(folder / out / "attitude.csv") for out in ("out", "other")]
     for one, other in zip(*rows, strict=False):
         assert abs(float(one["z_m"]) - float(other["z_m"])) < 0.05
 
@@ -68,7 +67,7 @@ def test_pictures_without_the_target_have_no_pose(recording, kind, count):
     for k in range(count):
         scene = background(kind, rng, (640, 480)) + 2 * rng.normal(size=(480, 640))
         cv2.imwrite(str(folder / kind / f"{k}.png"), np.clip(scene, 0, 255).astype(np.uint8))
-    done = typed(folder, pictures=kind)
+    done = tracked(folder, pictures=kind)
     assert done.exit_code == 4
     assert f"no target was found in {count} frame" in done.output
 
@@ -77,7 +76,7 @@ def test_a_lens_without_covariance_is_at_best_a_check(recording):
     folder, _, _ = recording
     content = yaml.safe_load((folder / "camera.yaml").read_text())
     (folder / "bare.yaml").write_text(yaml.safe_dump({k: v for k, v in content.items() if k != "covariance"}))
-    done = typed(folder, "--limit", "4", camera="bare.yaml")
+    done = tracked(folder, "--limit", "4", camera="bare.yaml")
     assert done.exit_code == 0
     assert "CHECK" in done.output
     assert "BP-J06" in (folder / "other" / "report.html").read_text("utf-8")
@@ -90,7 +89,7 @@ def test_a_wrong_focal_length_is_named_with_its_correction(recording, error):
     for name in ("fx", "fy"):
         content["camera_matrix"][name] *= 1 + error
     (folder / "zoomed.yaml").write_text(yaml.safe_dump(content))
-    done = typed(folder, camera="zoomed.yaml")
+    done = tracked(folder, camera="zoomed.yaml")
     assert done.exit_code == 4
     found = re.search(r"focal length of nose by ([-+.\d]+) ± ([.\d]+) %", done.output)
     correction, sigma = map(float, found.groups())
@@ -119,7 +118,7 @@ def test_a_pass_states_the_error_of_the_focal_length_that_would_not_show(recordi
 def test_a_wrong_target_is_one_plain_line(recording, change, words):
     folder, _, _ = recording
     (folder / "wrong.yaml").write_text(yaml.safe_dump(change))
-    done = typed(folder, target="wrong.yaml")
+    done = tracked(folder, target="wrong.yaml")
     assert done.exit_code == 2
     assert words in done.output
     assert "Traceback" not in done.output
@@ -129,7 +128,7 @@ def test_pictures_of_another_size_than_the_cameras_are_refused(recording):
     folder, _, _ = recording
     (folder / "small").mkdir()
     cv2.imwrite(str(folder / "small" / "0.png"), np.zeros((240, 320), np.uint8))
-    done = typed(folder, pictures="small")
+    done = tracked(folder, pictures="small")
     assert done.exit_code == 2
     assert "expected pictures of 640 x 480 px, as of camera.yaml, got 320 x 240 px" in done.output
 
@@ -138,7 +137,7 @@ def test_a_failed_calibration_is_not_used(recording):
     folder, _, _ = recording
     content = yaml.safe_load((folder / "camera.yaml").read_text())
     (folder / "failed.yaml").write_text(yaml.safe_dump({**content, "calibration": {"verdict": "FAIL"}}))
-    assert typed(folder, camera="failed.yaml").exit_code == 3
+    assert tracked(folder, camera="failed.yaml").exit_code == 3
 
 
 class Panels:
