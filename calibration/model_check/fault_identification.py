@@ -263,6 +263,7 @@ _STEP_CHI2 = 60.0  # least difference of a step to constant faults; of 6 paramet
 _STEP_SHARE = 0.05  # of what the step explains: a constant fault that is not linear is fitted better in a part as well
 _LEAST_NOISE = 0.1  # noise scale: sigmas that are stated too large hide no step
 _STEP_FRAMES = 5  # before the step and after it
+_LEAST_STEP = 0.3  # sum of its squares over the spots, in stated sigmas, in a frame: less may be errors of places
 
 
 def movement_of_a_camera(weighted: WeightedDiagnosis, faults: Sequence[PossibleFault]) -> int:
@@ -288,7 +289,8 @@ def movement_of_a_camera(weighted: WeightedDiagnosis, faults: Sequence[PossibleF
         explained = np.einsum("ki,ki->k", b, np.linalg.solve(N, b[..., None])[..., 0])
         k = _STEP_FRAMES + int(np.argmax(explained[_STEP_FRAMES : K - _STEP_FRAMES]))
         gain = float(explained[k]) - max(float(explained[0]), constant)
-        if gain > max(_STEP_CHI2, _STEP_SHARE * explained[k], most):
+        large = gain * variance > _LEAST_STEP * (K - k)
+        if large and gain > max(_STEP_CHI2, _STEP_SHARE * explained[k], most):
             most, out = gain, k
     return out
 

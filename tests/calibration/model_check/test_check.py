@@ -63,6 +63,16 @@ def test_a_camera_that_moves_during_a_recording_is_found_with_its_frame(scene, m
         assert found is None
 
 
+@pytest.mark.parametrize("scene", SCENES)
+def test_errors_of_places_within_the_sigmas_are_no_movement_of_a_camera(scene):
+    """Two rests in speckle: errors of each, within the stated sigmas, differ between both."""
+    run, recording = recorded(scene, 5, frames=120, claimed_px=16 * NOISE_PX)
+    of_rest = 2 * NOISE_PX * np.random.default_rng(4).standard_normal((2, *recording.uv_px.shape[1:]))
+    errors = recording.uv_px - run.uv_px[:120] + of_rest[(np.arange(120) >= 70).astype(int)]
+    result = evaluate_model(run.rig, dataclasses.replace(recording, uv_px=run.uv_px[:120] + errors))
+    assert result.moved_at_s is None
+
+
 @pytest.mark.slow
 def test_two_hundred_correct_recordings_raise_no_alarm_and_their_p_values_are_uniform():
     """Alarms are too rare to count (1e-6 each); uniform p-values show that the stated rate is correct."""
