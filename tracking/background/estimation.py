@@ -236,7 +236,7 @@ def _with_shifts(
     rest_shifts_px = shift.over_light * shifts_at_rest(mean, own, still)
     return replace(
         better, spot_px=width, shifts_px=shifts_px, rest_shifts_px=rest_shifts_px, misfit_share=share,
-        grainy=grainy(alone, background.noise),
+        grainy=grainy(pictures[::TRIED], alone, background.noise),
     )  # fmt: skip
 
 

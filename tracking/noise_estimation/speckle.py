@@ -29,6 +29,7 @@ _AT_REST = 0.5  # widths: what moves by less between any two pictures is at rest
 # rms of what a Gaussian leaves, over its height, without noise: of plain, wide, flat and long spots up to 0.06 in the
 # median, of developed speckle 0.08 to 0.14 (pixels as wide as 1 to 5 grains); of objects mostly more.
 _GRAINY, _OBJECT, _EVEN = 0.075, 0.25, 0.03
+_ROUGH = 0.008  # variance over the square of the mean: 0.03 to 0.2 of speckle, 0.001 of other spots
 _FEWEST_LIGHTS = 4  # whose median counts
 _INSIDE = 2.0  # widths of a light in sums: points that are nearer to its centre are parts of it ...
 _SHARE = 0.05  # ... with at least this share of its flux
@@ -44,7 +45,7 @@ def shows_grains(pictures: Sequence[Picture], found: Sequence[Detections], model
     """
     objects = is_limited_by_texture(model)
     counted = _counted(found, model, objects)
-    if not objects and grainy(counted, model):
+    if not objects and grainy(pictures, counted, model):
         return True
     if not any(map(len, counted)) or np.median(np.concatenate([_left_over(c, model) for c in counted])) < _EVEN:
         return False
@@ -55,11 +56,18 @@ def shows_grains(pictures: Sequence[Picture], found: Sequence[Detections], model
     return bool(np.count_nonzero(several) >= fewest and several.mean() > often)
 
 
-def grainy(found: Sequence[Detections], model: NoiseModel) -> bool:
-    """Whether lights that move are wide enough to be measured in sums of pixels, and most of them are grainy."""
-    wide = [_clear(points, model) for points in found]
-    left_over = np.concatenate([_left_over(points[_width(points) > _WIDTH], model) for points in wide])
-    return len(left_over) >= _FEWEST_LIGHTS and bool(np.median(left_over) > _GRAINY)
+def grainy(pictures: Sequence[Picture], found: Sequence[Detections], model: NoiseModel) -> bool:
+    """Whether lights that move are wide enough to be measured in sums of pixels, and most of them are grainy.
+
+    found: in each of the pictures (h, w). Flat beams are no Gaussians either, but from pixel to pixel they are even.
+    """
+    clear = [_clear(points, model) for points in found]
+    wide = [points[_width(points) > _WIDTH] for points in clear]
+    left_over = np.concatenate([_left_over(points, model) for points in wide])
+    if len(left_over) < _FEWEST_LIGHTS or np.median(left_over) <= _GRAINY:
+        return False
+    rough = [_roughness(*lights, model) for lights in zip(pictures, wide, strict=True)]
+    return bool(np.median(np.concatenate(rough)) > _ROUGH)
 
 
 def _in_sums(picture: Picture, parameters: DetectParameters, model: NoiseModel) -> Detections:
@@ -78,6 +86,19 @@ def _left_over(points: Detections, model: NoiseModel) -> Array:
     assert points.unexplained is not None
     noise = (model.floor_dn2 + 0.5 * model.slope_dn * points.peak) / points.peak**2
     return np.sqrt(np.maximum(points.unexplained**2 - noise, 0.0))
+
+
+def _roughness(picture: Picture, points: Detections, model: NoiseModel) -> Array:
+    """(n,): variance of the pixels in the core of each light, over its mean squared, without noise and slopes."""
+    out = np.zeros(len(points))
+    for k, (at, width) in enumerate(zip(points.uv_px, _width(points), strict=True)):
+        first = np.maximum(np.rint(at - width), 0).astype(int)
+        u, v = first + 2 * int(width) + 1
+        core = picture[first[1] : v, first[0] : u].astype(float)
+        left = np.diff(np.diff(core, axis=0), axis=1)  # of four pixels what no plane explains: twice their sigma
+        light = float(core.mean()) - model.black_dn
+        out[k] = (0.25 * np.mean(left**2) - float(model.variance(core.mean()))) / light**2 if left.size else 0.0
+    return out
 
 
 def _clear(points: Detections, model: NoiseModel) -> Detections:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -68,3 +69,20 @@ def test_a_laser_spot_is_one_point_however_grainy_it_is(tmp_path, width_px, grai
         error = nearest[["u_px", "v_px"]].to_numpy() - spots
         ratios.append(error / nearest[["sigma_u_px", "sigma_v_px"]].to_numpy())
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
+def test_flat_beams_without_speckle_are_measured_in_their_pixels(tmp_path):
+    """No Gaussian fits them, but nothing in them is grainy: sums of pixels would only lose resolution."""
+    rng = np.random.default_rng(8)
+    v, u = np.ogrid[: SIZE[0], : SIZE[1]]
+    for k in range(FRAMES):
+        light = np.zeros(SIZE)
+        for at in PLACES + k * np.array([3.1, 1.7]):
+            light += np.clip(8.5 - np.hypot(v - at[1], u - at[0]), 0.0, 1.0)  # a disc with a radius of 8 px
+        electrons = rng.poisson(FULL_E * (0.02 + 0.4 * light)) + rng.normal(0.0, 4.0, SIZE)
+        grey = np.clip(np.rint(electrons * 255 / FULL_E + 8), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"p_{k:03d}.png"), grey)
+    done = CliRunner().invoke(main, ["detect", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    noise = json.loads((tmp_path / "out" / "summary.json").read_text())["noise"]
+    assert [camera["summed_px"] for camera in noise] == [1]
