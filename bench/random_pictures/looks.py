@@ -46,7 +46,7 @@ class Look:
     plain_rig: bool = False  # the rig of the paper at 1280 x 1024
     shake_px: float = 0.0  # rotation of each camera in each picture, about each axis, times its focal length; rms
     bands: float = 0.0  # of the ambient light, share: lamps that flicker while the sensor reads its rows; amplitude
-    patterns: int = 0  # independent ones in fully developed speckle; 0: lognormal speckle
+    patterns: int = 0  # independent ones in fully developed speckle, of contrast 1 / sqrt(patterns); 0: none
     photograph: float = 0.0  # share of the laser light that the darkest place of a photograph takes; 0: no photograph
 
     @property
@@ -61,7 +61,8 @@ class Look:
         parts += [shape.strip()] if shape.strip() else []
         parts += [f"halo {self.halo:.2g}"] if self.halo else []
         parts += [f"texture {self.texture:.1%} grain {self.texture_grain_px:.1f} px"] if self.texture else []
-        parts += [f"speckle {self.speckle:.2g} grain {self.speckle_grain_px:.1f} px"] if self.speckle else []
+        contrast = self.patterns**-0.5 if self.patterns else self.speckle
+        parts += [f"speckle {contrast:.2g} grain {self.speckle_grain_px:.1f} px"] if contrast else []
         parts += [f"flicker {self.flicker:.1%}"] if self.flicker else []
         parts += [f"drift {self.drift:.1%}"] if self.drift else []
         for count, what in ((self.reflections, "reflections"), (self.details, "details"), (self.hot_pixels, "hot px")):
@@ -200,11 +201,9 @@ FAMILIES: dict[str, Callable[[np.random.Generator, Look], Look]] = {
     "shaking": lambda r, k: replace(_photographs(r, k), shake_px=_log(r, 0.03, 1.0)),
     "row-noise": lambda r, k: replace(k, sensor=replace(k.sensor, row_e=float(r.uniform(0.5, 1.0) * k.sensor.read_e))),
     # Physical: intensities of fields of random phases, seen through a round aperture; two patterns: both polarisations.
-    "laser": lambda r, k: (
-        lambda patterns: replace(
-            k, patterns=patterns, speckle=patterns**-0.5, speckle_grain_px=_log(r, 0.15, 0.6), sigma_px=_log(r, 0.9, 5)
-        )
-    )(int(r.integers(1, 3))),
+    "laser": lambda r, k: replace(
+        k, patterns=int(r.integers(1, 3)), speckle_grain_px=_log(r, 0.15, 0.6), sigma_px=_log(r, 0.9, 5)
+    ),
 }  # fmt: skip
 
 

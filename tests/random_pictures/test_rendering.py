@@ -244,6 +244,7 @@ def test_looks_stay_within_what_cameras_do(family):
         assert 0 <= look.background <= 0.32
         assert 5_000 <= look.sensor.full_well_e <= 60_000
         assert 0 <= look.speckle <= 0.3
+        assert look.patterns in (0, 1, 2)
         assert 0 <= look.texture <= 0.06
         assert look.text
 
