@@ -75,6 +75,7 @@ class CameraNoise:
     wide: WideLights | None = field(default=None, init=False)  # None: sums of pixels have no background
     too_wide_px: float = field(default=0.0, init=False)  # sigma of a light that max_sigma_px excludes; 0: none
     px: float = 1.0  # side of its pixels, which may be sums, in pixels of the camera
+    shown: float = float("nan")  # misfit_share of the lights in the pixels of these sums; nan: none, or not known
     of_sums: CameraNoise | None = field(default=None, init=False)  # where speckle breaks spots into grains
     unfit: int = field(default=0, init=False)  # consecutive pictures that do not fit the background
     # Of which the noise was estimated, until a background is made: it may show that sums are better
@@ -91,6 +92,9 @@ class CameraNoise:
         if not pictures:
             return
         self.estimate = estimate_noise(pictures, self._black_dn)
+        shift = self.estimate.texture_shift
+        if not np.isfinite(shift.misfit_share):  # in sums spots may be too narrow to show what their pixels did
+            self.estimate = replace(self.estimate, texture_shift=replace(shift, misfit_share=self.shown))
         self.mosaic = mosaic_contrast(pictures[0])
         self._update_model()
         self._first = list(pictures) if self.shows_structure and not self.estimate.grainy else []
@@ -114,7 +118,8 @@ class CameraNoise:
             matrix = np.diag([1 / SIDE, 1 / SIDE, 1.0]) @ optics.matrix
             matrix[:2, 2] -= 0.5 * (1 - 1 / SIDE)
             optics = replace(optics, image_size_px=(width // SIDE, height // SIDE), matrix=matrix)
-        out = CameraNoise(self.camera, notes=self.notes, optics=optics, px=SIDE * self.px)
+        shown = float("nan") if self.estimate is None else self.estimate.texture_shift.misfit_share
+        out = CameraNoise(self.camera, notes=self.notes, optics=optics, px=SIDE * self.px, shown=shown)
         out.estimate_from([squares_of(p, SIDE) for p in pictures])
         return out
 

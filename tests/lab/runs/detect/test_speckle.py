@@ -86,3 +86,15 @@ def test_flat_beams_without_speckle_are_measured_in_their_pixels(tmp_path):
     assert done.exit_code == 0, done.output
     noise = json.loads((tmp_path / "out" / "summary.json").read_text())["noise"]
     assert [camera["summed_px"] for camera in noise] == [1]
+
+
+def test_spots_too_narrow_in_sums_have_the_error_that_their_pixels_show(tmp_path):
+    """In the pixels a fifth of a pixel, 0.06 of the width, is seen; in the sums no spot is wide enough to show it."""
+    recording(tmp_path, 3.0, 0.35, 2, 3.0)
+    done = CliRunner().invoke(main, ["detect", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    noise = json.loads((tmp_path / "out" / "summary.json").read_text())["noise"][0]
+    assert noise["summed_px"] == 2
+    table = pd.read_csv(tmp_path / "out" / "detections.csv")
+    share = table[["sigma_u_px", "sigma_v_px"]].min(axis=1) / np.sqrt(table["major_px"] * table["minor_px"])
+    assert share.min() > 0.9 * noise["estimated"]["texture_shift"]["misfit_share"]
