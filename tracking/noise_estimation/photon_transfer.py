@@ -42,6 +42,7 @@ _SURE = 0.25  # sigma of the slope's logarithm up to which photon transfer alone
 _MOST_SPOTS = 40  # per picture: the brightest
 _LEAST_OF_SPOTS, _MOST_OF_SPOTS = 30, 300  # pixels per brightness class; residuals of one spot are not independent
 _CONTRASTS = (0.0, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # contrasts of the light's grain that are tried
+_ABOVE_TEXTURE = 10.0  # sigmas of the texture: peak of a narrow light that is none of its grains
 _STEPS_SEEN = 0.003  # of a background: rounding errors above this look like texture ...
 _TEXTURE_SEEN = 0.5  # ... unless they are smaller than this share of it
 _OF_STEP = 0.42  # of a block's step, as its sigma: with the usual threshold a spot must be 2.1 steps high
@@ -116,7 +117,7 @@ def estimate_noise(pictures: Sequence[Picture], black_dn: float | None = None) -
     stepped = steps > max(_STEPS_SEEN, _TEXTURE_SEEN * model.texture) * background
     found = [find_spots(p, DetectParameters(max_detections=_MOST_SPOTS), model) for p in usable]
     shift = TextureShift.usual(usable[0]) if stepped else texture_shift(seen, model, full, found, black_dn)
-    shift = shift.with_lights(found)
+    shift = shift.with_lights(found, _ABOVE_TEXTURE * model.texture * background)
     model = replace(model, profile=spot_profile(usable, found, model, saturation))
     grainy = shows_grains(usable, found, model, top)
     return NoiseEstimate(model, floor_sigma, slope_sigma, saturation, step, len(usable), levels.temporal, shift, grainy)

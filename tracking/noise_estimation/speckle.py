@@ -32,7 +32,7 @@ _GRAINY, _OBJECT, _EVEN = 0.075, 0.25, 0.03
 _ROUGH = 0.008  # variance over the square of the mean: 0.03 to 0.2 of speckle, 0.001 of other spots
 _FEWEST_LIGHTS = 4  # whose median counts
 _INSIDE = 2.0  # widths of a light in sums: points that are nearer to its centre are parts of it ...
-_SHARE = 0.05  # ... with at least this share of its flux
+_SHARE, _NARROWER = 0.05, 0.8  # ... with at least this share of its flux, and narrower than its smaller half axis
 _OFTEN, _FEWEST = 0.08, 2  # share and number of the lights that consist of several points ...
 _MOSTLY = 0.5  # ... in front of objects, where there is one in each picture
 
@@ -115,9 +115,10 @@ def _counted(found: Sequence[Detections], model: NoiseModel, objects: bool) -> l
 
 
 def _parts(lights: Detections, points: Detections) -> Ints:
-    """(n,): number of the points that are parts of each light."""
+    """(n,): number of the points that are parts of each light. Two beams beside each other are as wide as their sum."""
     apart = np.linalg.norm(lights.uv_px[:, None] - points.uv_px[None], axis=2)
     inside = (apart < _INSIDE * _width(lights)[:, None]) & (points.flux[None] > _SHARE * lights.flux[:, None])
+    inside &= _width(points)[None] < _NARROWER * lights.minor_px[:, None]
     return np.asarray(np.count_nonzero(inside, axis=1))
 
 

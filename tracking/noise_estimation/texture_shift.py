@@ -83,10 +83,11 @@ class TextureShift:
         light, none = tuple(_USUAL_TEXTURE * w for w in _WIDTHS_PX), tuple(0.0 for _ in _WIDTHS_PX)
         return TextureShift(_WIDTHS_PX, light, none, False, 0.5 * float(np.hypot(*picture.shape)))
 
-    def with_lights(self, found: Sequence[Detections]) -> TextureShift:
+    def with_lights(self, found: Sequence[Detections], least_dn: float = 0.0) -> TextureShift:
         """These errors with `misfit_share` from the lights found in pictures.
 
-        Reflections are much wider than the spots, which are the bright lights, and no Gaussians.
+        Reflections are much wider than the spots, which are the bright lights, and no Gaussians. least_dn: peak of
+        narrow ones that are no texture.
         """
         narrow: list[float] = []
         shares: list[float] = []
@@ -101,7 +102,7 @@ class TextureShift:
             clear = (width < _WIDER * usual_px) & (variance * (1 - misfit) < (_CLEAR * width) ** 2)
             share, wide = np.sqrt(misfit * variance) / width, width > _RESOLVED_PX
             shares.extend(share[clear & wide])
-            narrow.extend(share[clear & ~wide])
+            narrow.extend(share[clear & ~wide & (points.peak > least_dn)])
         usual, of_all = _usual_of(shares), _usual_of(narrow + shares)
         usual = of_all if of_all > DEVELOPED_SPECKLE else usual
         return replace(self, misfit_share=usual) if np.isfinite(usual) else self
