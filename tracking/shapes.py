@@ -12,6 +12,9 @@ import numpy as np
 from geometry.arrays import Array
 from tracking.detections import Detections
 
+# Share of its width by which developed speckle moves a centre, at least: 0.06 to 0.3. Texture moves it by up to 0.04,
+# pixels by less, so above this narrow spots show it, too.
+DEVELOPED_SPECKLE = 0.06
 # Classes of points by the rms of what the Gaussian leaves, over its height: below the first limit, below the second,
 # and all others, with those less round than this (ratio of the half axes). In front of photographs 70, 21 and 9 % of
 # the spots and 1, 3 and 96 % of the objects are in these classes; speckle and structure in real light leave more.

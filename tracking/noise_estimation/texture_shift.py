@@ -23,6 +23,7 @@ from tracking.detections import Detections
 from tracking.noise import BLOCK, NORMAL_68, NoiseModel, Picture, quantile_variance
 from tracking.noise_estimation.black_level import level_over_light
 from tracking.noise_estimation.texture import MeanPicture
+from tracking.shapes import DEVELOPED_SPECKLE
 
 _WIDTHS_PX = (0.8, 1.6, 3.2, 6.4, 12.8, 25.6)  # of spots
 _COARSE_PX = 4.0  # width from which the smooth part of the background counts: it may be uneven response (vignetting)
@@ -38,9 +39,6 @@ _FEWER_PIXELS = 1.6  # pixels per sigma of a spot above which pixels are average
 _NARROWEST_PX = 0.5  # half axis, with the pixel's own width
 _USUAL = 0.3  # quantile of the lights' misfits: of reflections and other clutter many have larger ones than spots
 _RESOLVED_PX, _CLEAR = 1.8, 0.02  # width from which a misfit shows; noise of the centre, in widths, of clear lights
-# Share of the width by which developed speckle moves a centre, at least: 0.06 to 0.3. Texture moves it by up to 0.04,
-# pixels by less, so above this narrow lights count as well.
-DEVELOPED_SPECKLE = 0.06
 _FEWEST_LIGHTS = 6  # whose quantile is used
 _WIDER = 4.0  # times the usual width: no spot
 _CLEARLY_MORE = 6.0  # ratio of the variance that a fit shows to that expected: of one spot it has a factor of two

@@ -11,10 +11,10 @@ import numpy as np
 from geometry.arrays import Array, Bools, Ints, evenly_spread
 from geometry.compiled_projection import Views, project_all
 from geometry.forward_model import SpotModel
-from tracking.noise_estimation.texture_shift import DEVELOPED_SPECKLE
 from tracking.rigid_body.association.frame_detections import BLENDED
 from tracking.rigid_body.models.information import single_frame_pose
 from tracking.rigid_body.online_estimates import DEADBAND
+from tracking.shapes import DEVELOPED_SPECKLE
 from tracking.smoothing.motion.run_detections import Reference, RunDetections, fit_frames, labelled_points
 from tracking.smoothing.place_errors import (
     PLACE_FACTOR,

@@ -795,7 +795,7 @@ def test_poses_after_a_knock_of_one_of_two_cameras_do_not_use_its_pictures(shift
 @pytest.mark.parametrize("shown", [True, False])
 def test_a_vehicle_that_turns_away_faster_than_ever_before_has_no_predicted_poses(shown, tmp_path):
     """Two frames show its spots far from the prediction, then none do: the sigmas of a calm motion do not hold."""
-    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=90, detections_only=True)
+    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=90, points=True)
     points = pd.read_csv(run_folder / "detections.csv")
     for camera, axis in (("left", "u_px"), ("right", "v_px")):
         for turned, frame in enumerate((40, 41), start=1):
@@ -810,7 +810,7 @@ def test_a_vehicle_that_turns_away_faster_than_ever_before_has_no_predicted_pose
 
 def test_a_spot_that_never_hits_its_screen_is_a_point_to_check(tmp_path):
     """`beampose check` names it; the run was a PASS."""
-    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=40, detections_only=True)
+    run_folder = simulate("smooth", tmp_path / "run", seed=4, frames=40, points=True)
     assert process_run(run_folder, tmp_path / "before").verdict.status == "pass"
     rig = yaml.safe_load((run_folder / "rig.yaml").read_text("utf-8"))
     beam, of = next(iter(rig["target"]["beams"].values())), next(iter(rig["target"]["spots"].values()))
