@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,8 @@ def squares_of(picture: Picture, side: int = WIDE_SIDE) -> NDArray[np.uint16]:
 
     side: of the squares, px, at most 8.
     """
+    import cv2  # 50 ms, which runs of points save
+
     height, width = (n // side for n in picture.shape)
     if not (height and width):
         return np.zeros((height, width), np.uint16)
