@@ -96,8 +96,9 @@ def _roughness(picture: Picture, points: Detections, model: NoiseModel) -> Array
         u, v = first + 2 * int(width) + 1
         core = picture[first[1] : v, first[0] : u].astype(float)
         left = np.diff(np.diff(core, axis=0), axis=1)  # of four pixels what no plane explains: twice their sigma
-        light = float(core.mean()) - model.black_dn
-        out[k] = (0.25 * np.mean(left**2) - float(model.variance(core.mean()))) / light**2 if left.size else 0.0
+        if left.size:  # at the border there may be no core
+            light = max(float(core.mean()) - model.black_dn, 1.0)
+            out[k] = (0.25 * np.mean(left**2) - float(model.variance(core.mean()))) / light**2
     return out
 
 
