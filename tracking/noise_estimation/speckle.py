@@ -25,6 +25,7 @@ from tracking.squares import for_squares, noise_of_squares, of_squares, squares_
 SIDE = 2  # px: of the squares; where that is not enough, sums of sums
 _WIDTH = 2.4  # px: of a spot, at least: in sums its place within a square hardly matters then
 _CLEAR = 20.0  # peak of the lights that count, in sigmas of the noise of the background
+_MOVING = 0.25  # share of the lights that move, at least: grains of some that rest are seen in some pictures only
 _AT_REST = 0.5  # widths: what moves by less between any two pictures is at rest
 # rms of what a Gaussian leaves, over its height, without noise: of plain, wide, flat and long spots up to 0.06 in the
 # median, of developed speckle 0.08 to 0.14 (pixels as wide as 1 to 5 grains); of objects mostly more.
@@ -32,7 +33,8 @@ _GRAINY, _OBJECT, _EVEN = 0.075, 0.25, 0.03
 _ROUGH = 0.008  # variance over the square of the mean: 0.03 to 0.2 of speckle, 0.001 of other spots
 _FEWEST_LIGHTS = 4  # whose median counts
 _INSIDE = 2.0  # widths of a light in sums: points that are nearer to its centre are parts of it ...
-_SHARE, _NARROWER = 0.05, 0.8  # ... with at least this share of its flux, and narrower than its smaller half axis
+_SHARE = 0.05  # ... with at least this share of its flux
+_NARROWER = 0.8  # times the smaller half axis of a light: a narrower part of it is no beam beside another
 _OFTEN, _FEWEST = 0.08, 2  # share and number of the lights that consist of several points ...
 _MOSTLY = 0.5  # ... in front of objects, where there is one in each picture
 
@@ -109,18 +111,18 @@ def _clear(points: Detections, model: NoiseModel) -> Detections:
 
 
 def _counted(found: Sequence[Detections], model: NoiseModel, objects: bool) -> list[Detections]:
-    """The clear points of each picture that move; where nothing moves, and there are no objects, all."""
+    """The clear points of each picture that move; where hardly any does, and there are no objects, all."""
     clear = [_clear(points, model) for points in found]
     moving = [points[_moves(points, found[:k], found[k + 1 :])] for k, points in enumerate(clear)]
-    return moving if objects or any(map(len, moving)) else clear
+    return moving if objects or sum(map(len, moving)) > _MOVING * sum(map(len, clear)) else clear
 
 
 def _parts(lights: Detections, points: Detections) -> Ints:
-    """(n,): number of the points that are parts of each light. Two beams beside each other are as wide as their sum."""
+    """(n,): number of the points that are parts of each light; 1 for beams beside each other: none of them is narrow."""
     apart = np.linalg.norm(lights.uv_px[:, None] - points.uv_px[None], axis=2)
     inside = (apart < _INSIDE * _width(lights)[:, None]) & (points.flux[None] > _SHARE * lights.flux[:, None])
-    inside &= _width(points)[None] < _NARROWER * lights.minor_px[:, None]
-    return np.asarray(np.count_nonzero(inside, axis=1))
+    narrow = inside & (_width(points)[None] < _NARROWER * lights.minor_px[:, None])
+    return np.asarray(np.where(narrow.any(axis=1), np.count_nonzero(inside, axis=1), inside.any(axis=1)))
 
 
 def _moves(lights: Detections, *others: Sequence[Detections]) -> Bools:
