@@ -118,7 +118,7 @@ def _counted(found: Sequence[Detections], model: NoiseModel, objects: bool) -> l
 
 
 def _parts(lights: Detections, points: Detections) -> Ints:
-    """(n,): number of the points that are parts of each light; 1 for beams beside each other: none of them is narrow."""
+    """(n,): number of the points that are parts of each light; 1 for beams beside each other, none of them narrow."""
     apart = np.linalg.norm(lights.uv_px[:, None] - points.uv_px[None], axis=2)
     inside = (apart < _INSIDE * _width(lights)[:, None]) & (points.flux[None] > _SHARE * lights.flux[:, None])
     narrow = inside & (_width(points)[None] < _NARROWER * lights.minor_px[:, None])
