@@ -49,7 +49,8 @@ def shows_grains(pictures: Sequence[Picture], found: Sequence[Detections], model
     counted = _counted(found, model, objects)
     if not objects and grainy(pictures, counted, model):
         return True
-    if not any(map(len, counted)) or np.median(np.concatenate([_left_over(c, model) for c in counted])) < _EVEN:
+    left_over = np.concatenate([_left_over(points, model) for points in counted])
+    if not len(left_over) or np.median(left_over) < _EVEN:
         return False
     usual = replace(DetectParameters(), saturation_dn=clips_dn)
     lights = _counted([_in_sums(picture, usual, model) for picture in pictures], model, objects)

@@ -152,7 +152,6 @@ class CameraNoise:
 
         call: calls a function with arguments, maybe in another process.
         """
-        given = pictures
         if pictures and self.of_sums is not None:
             sums = [squares_of(p, SIDE) for p in pictures]
             self.of_sums.make_background(sums, self._in_sums(parameters, pictures[0]), call)
@@ -161,20 +160,20 @@ class CameraNoise:
             usual = self._with_saturation(parameters, pictures[0])
             moved_px = float(np.linalg.norm(shift_between(pictures[0], pictures[-1])))
             self.moved_px = self.px * moved_px if moved_px > FARTHEST_PX else 0.0
-            motion = None
+            motion, still = None, pictures
             if self.optics is not None:
                 motion = call(CameraMotion.of, pictures, self.optics, self.model, without_wide(usual))
             if motion is not None:
                 clips = saturation_of(usual, pictures[0])
-                pictures = [still for p in pictures if (still := motion.stilled(p, clips)[0]) is not None]
-            wide = WideLights.of(pictures, self.model, usual, partial(call, static_background))
+                still = [s for p in pictures if (s := motion.stilled(p, clips)[0]) is not None]
+            wide = WideLights.of(still, self.model, usual, partial(call, static_background))
             self.too_wide_px = 0.0 if wide is None else self.px * wide.excluded_px
             shift, others_move = self.estimate.texture_shift, self.too_wide_px > 0
-            background = call(static_background, pictures, self.model, shift, without_wide(usual), others_move)
+            background = call(static_background, still, self.model, shift, without_wide(usual), others_move)
             self.motion, self.wide, self.background = motion, wide, background
             if background is not None and background.grainy and self._first:
                 self.of_sums = self._of_sums(self._first)
-                self.make_background(given, parameters, call)
+                self.make_background(pictures, parameters, call)
             self._first = []
 
     def _take_over(self, of_sums: CameraNoise) -> None:

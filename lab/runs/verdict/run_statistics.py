@@ -25,6 +25,7 @@ from lab.runs.frames.pipeline import LEFT_OUT, FrameRecord, Pair
 from lab.runs.verdict.moved_camera import MovedCamera, ShownSpots
 from tracking.consistency import SpotAgreement, against_causal, against_own_spots, contradictory, is_covariance
 from tracking.detections import UNMATCHED
+from tracking.smoothing.labels.neighbouring_frames import USUAL_POINTS
 from tracking.statuses import Event, PoseStatus, SpotStatus, TrackedFrame, Word
 
 
@@ -242,7 +243,6 @@ FEWEST_SPOTS = 3  # a pose needs this many
 MOST_EVENTS = 500  # listed one by one; of the others the number is reported
 # Events that may continue in the next frame: listed once, with their last frame.
 LASTING = ("undecided", "changed", CONTRADICTION, "not_a_covariance")
-_USUAL_CLUTTER = 0.95  # quantile, over the measured frames, of the unlabelled points that count as usual clutter
 _MOST_POINTS = 50  # larger numbers of unlabelled points are counted as this number
 
 
@@ -455,7 +455,7 @@ class RunStatistics:
         for surplus in sorted(self._surplus):
             below += self._surplus[surplus]
             usual = surplus
-            if below >= _USUAL_CLUTTER * total:
+            if below >= USUAL_POINTS * total:
                 break
         out: Counter[FrameCause] = Counter()
         for (cause, surplus), frames in self._causes.items():
